@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Precomputed radiance transfer for Blender: bake once, relight at once. This module registers and nothing else."""
+
+from __future__ import annotations
+
+import bpy
+
+from .operators import commands, live_preview, properties
+from .operators.analyze import PRT_OT_analyze
+from .operators.bake import PRT_OT_bake, PRT_OT_cancel
+from .operators.clear import PRT_OT_clear
+from .operators.job_mixin import JobMixin
+from .operators.preview import PRT_OT_toggle_preview
+from .panels.sidebar import PRT_PT_bake, PRT_PT_preview, PRT_PT_results
+
+CLASSES = (
+    properties.PRTSettings,
+    properties.PRTBakedObject,
+    properties.PRTSession,
+    PRT_OT_analyze,
+    PRT_OT_bake,
+    PRT_OT_cancel,
+    PRT_OT_clear,
+    PRT_OT_toggle_preview,
+    PRT_PT_bake,
+    PRT_PT_preview,
+    PRT_PT_results,
+)
+
+
+def register() -> None:
+    """Called by Blender when the extension is enabled."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    properties.register()
+    live_preview.register()
+    commands.register()
+
+
+def unregister() -> None:
+    """Called by Blender when the extension is disabled: nothing stays behind."""
+    JobMixin.stop_now()
+    commands.unregister()
+    live_preview.unregister()
+    properties.unregister()
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

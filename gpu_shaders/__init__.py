@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pictures of baked objects on the GPU: the only folder that imports gpu.
+
+Reading order is data order:
+
+    render_data.py   pure numpy: a BakedTransfer as the arrays that go to the GPU, and the signatures that say when
+                     they changed. Never imports gpu or bpy.
+    programs.py      GLSL files -> the two programs (cached; released by `programs.release`).
+    draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
+                     when the data's signature changes, relit when the light's changes, else only drawn.
+    viewport.py      the two draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
+    offscreen.py     `draw_camera` for background mode and the bpy wheel, `write_png`.
+
+The GLSL:
+
+    texel_layout.glsl          where value i of a long list lies in a 2D texture (prepended to readers of one)
+    exit_radiance.comp.glsl    once per light change: exit radiance of every point and row, into a texture
+    surface.vert.glsl          once per frame: fetches a point's exit radiance by gl_VertexID
+    surface.frag.glsl          multiplies the interpolated radiance by the interpolated albedo
+
+Method: clustered principal components (Sloan, Hall, Hart, Snyder 2003, "Clustered Principal Components for
+Precomputed Radiance Transfer", section 6): the light meets only the clusters' bases, on the CPU
+(`relighting.cluster_constants`), then each point sums its cluster's few products with its own weights. The paper draws
+clusters in separate passes and blends triangles between clusters; here every vertex evaluates its own cluster before
+interpolation, which gives the same picture in one pass and without overdraw. The sum runs once per light change, not
+once per frame, so a frame costs as much as a coloured mesh whatever the number of vectors.
+
+Colours are scene-linear from end to end; the view transform is Blender's own.
+"""

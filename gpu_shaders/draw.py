@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""GPU objects of baked objects. Needs an active GPU context; main thread only.
+
+GPUTexture and GPUVertBuf can't be updated, so the constants' texture is made anew per light change and dropped at once,
+while the encoding, the mesh and the texture of exit radiances live as long as the data's signature does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+
+import gpu
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import ArrayLike, NDArray
+
+from ..prt_addon.relighting.exit_radiance import cluster_constants
+from . import programs
+from .render_data import (
+    DrawItem,
+    RenderData,
+    clip_transform,
+    heat_colours,
+    light_signature,
+    make_render_data,
+    matching_light,
+    texture_values,
+)
+
+STALE_DIMMING = 0.3  # factor on a stale object's radiance
+
+
+def make_texture(texels: NDArray[np.float32]) -> gpu.types.GPUTexture:
+    """An RGBA32F texture of (height, width, 4) values."""
+    height, width, _ = texels.shape
+    buffer = gpu.types.Buffer("FLOAT", texels.size, np.ascontiguousarray(texels, np.float32).reshape(-1))
+    return gpu.types.GPUTexture((width, height), format="RGBA32F", data=buffer)
+
+
+def read_texture(texture: gpu.types.GPUTexture) -> NDArray[np.float32]:
+    """The values of an RGBA32F texture, (height, width, 4); row 0 is the texture's first, the lowest of a picture."""
+    return np.array(texture.read(), np.float32).reshape(texture.height, texture.width, 4)
+
+
+class ObjectDrawing:
+    """The mesh, encoding and exit radiances of one baked object."""
+
+    def __init__(self, data: RenderData) -> None:
+        self.data = data
+        self._batch = _make_batch(data)
+        self._encoding = make_texture(data.encoding)
+        self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
+
+    def relight(self, constants: NDArray[np.float32]) -> None:
+        """Compute every point's exit radiance from per-cluster constants (clusters, vectors + 1, rows, 3)."""
+        data = self.data
+        expected = (data.clusters, data.vectors + 1, data.rows, 3)
+        if constants.shape != expected:
+            raise ValueError(f"constants have shape {constants.shape}, the drawn data needs {expected}")
+        constant_values = make_texture(texture_values(constants.reshape(-1, 3)))  # must outlive the dispatch
+        program = programs.exit_radiance()
+        program.bind()
+        program.uniform_sampler("encoding_values", self._encoding)
+        program.uniform_sampler("constant_values", constant_values)
+        program.image("exit_values", self._exit)
+        program.uniform_int("points", data.points)
+        program.uniform_int("rows", data.rows)
+        program.uniform_int("vectors", data.vectors)
+        width, height = data.exit_size
+        gpu.compute.dispatch(program, width // programs.GROUP_SIZE, height, 1)
+
+    def show_colours(self, colours: NDArray[np.float32]) -> None:
+        """Draw (points, 3) colours in place of computed radiances."""
+        self._exit = make_texture(texture_values(np.repeat(colours, self.data.rows, axis=0)))
+
+    def exit_radiances(self) -> NDArray[np.float32]:
+        """The exit radiances on the GPU for unit albedo, (points, rows, 3). Waits for the GPU: for tests and export."""
+        count = self.data.points * self.data.rows
+        return read_texture(self._exit).reshape(-1, 4)[:count, :3].reshape(self.data.points, self.data.rows, 3)
+
+    def draw(self, transform: NDArray[np.floating], exposure: float = 1.0, use_albedo: bool = True) -> None:
+        """Draw into the active framebuffer; transform (4, 4) from baked world positions to clip space.
+
+        exposure: factor on the colours. use_albedo: multiply by the surface's albedo; without, unit albedo.
+        """
+        program = programs.surface()
+        program.bind()
+        program.uniform_sampler("exit_values", self._exit)
+        program.uniform_float("transform", Matrix(transform.tolist()))
+        program.uniform_float("exposure", exposure)
+        program.uniform_float("albedo_share", 1.0 if use_albedo else 0.0)
+        self._batch.draw(program)
+
+
+def _make_batch(data: RenderData) -> gpu.types.GPUBatch:
+    """The mesh with its albedo as an indexed batch; gl_VertexID is then the point's number."""
+    layout = gpu.types.GPUVertFormat()
+    layout.attr_add(id="position", comp_type="F32", len=3, fetch_mode="FLOAT")
+    layout.attr_add(id="albedo", comp_type="F32", len=3, fetch_mode="FLOAT")
+    vertices = gpu.types.GPUVertBuf(layout, data.points)
+    vertices.attr_fill("position", data.positions)
+    vertices.attr_fill("albedo", data.albedo)
+    return gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=gpu.types.GPUIndexBuf(type="TRIS", seq=data.triangles))
+
+
+class DrawingCache:
+    """The drawings of a changing list of objects: built, relit and dropped only when they have to be."""
+
+    def __init__(self) -> None:
+        self._drawings: dict[Hashable, ObjectDrawing] = {}
+        self._lights: dict[Hashable, Hashable] = {}
+
+    def __len__(self) -> int:
+        return len(self._drawings)
+
+    def draw(self, items: Iterable[DrawItem], view_projection: ArrayLike) -> None:
+        """Draw the items into the active framebuffer with the depth test on; leaves the GPU state as it was.
+
+        Raises BadScene when a light or a bake's size does not fit.
+        """
+        depth_test, depth_mask = gpu.state.depth_test_get(), gpu.state.depth_mask_get()
+        blend = gpu.state.blend_get()
+        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_mask_set(True)
+        gpu.state.blend_set("NONE")
+        gpu.state.face_culling_set("NONE")
+        try:
+            for item in items:
+                factor = item.exposure * (STALE_DIMMING if item.stale else 1.0)
+                drawing = self._prepared(item)
+                drawing.draw(clip_transform(view_projection, item.matrix), factor, item.heat is None)
+        finally:
+            gpu.state.depth_test_set(depth_test)
+            gpu.state.depth_mask_set(depth_mask)
+            gpu.state.blend_set(blend)
+
+    def _prepared(self, item: DrawItem) -> ObjectDrawing:
+        """The item's drawing, built if its key is new and relit if its light is."""
+        drawing = self._drawings.get(item.key)
+        if drawing is None:
+            drawing = self._drawings[item.key] = ObjectDrawing(make_render_data(item.baked))
+            self._lights.pop(item.key, None)
+        light = light_signature(item)
+        if self._lights.get(item.key) != light:
+            if item.heat is None:
+                coefficients = matching_light(item.light, drawing.data.columns)
+                drawing.relight(cluster_constants(item.baked.bases, coefficients))
+            else:
+                drawing.show_colours(heat_colours(item.heat))
+            self._lights[item.key] = light
+        return drawing
+
+    def keep_only(self, keys: set[Hashable]) -> None:
+        """Drop the drawings of objects that are no longer shown."""
+        for key in self._drawings.keys() - keys:
+            del self._drawings[key]
+            self._lights.pop(key, None)
+
+    def clear(self) -> None:
+        """Drop every GPU object."""
+        self._drawings.clear()
+        self._lights.clear()

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked objects in every 3D viewport: `enable(get_draw_list)` and `disable()`.
+
+Blender runs handlers at two points of a viewport's redraw. At PRE_VIEW the active framebuffer is the viewport's
+scene-linear picture, to which Blender applies the view transform later; at POST_VIEW, when the depth is known, the
+active framebuffer is the overlays', which is clipped and gets no view transform. So the first handler remembers the
+framebuffer of its region and the second draws into it. That a region's picture is what is bound at PRE_VIEW is
+internal to Blender: where it can't be bound or has another size, objects are drawn over the overlays instead (the
+colours of the Standard view transform) and `status()` says so.
+
+The objects themselves stay visible and are covered exactly: selection, outlines and occlusion stay right.
+Handlers do not run in final renders nor in viewport renders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+
+from ..prt_addon.errors import PRTError
+from . import programs
+from .draw import DrawingCache
+from .render_data import DrawItem
+
+GetDrawList = Callable[[], Sequence[DrawItem]]
+
+
+@dataclass
+class ViewportStatus:
+    """What a panel may say about the preview. error: the last draw's PRTError in words, or empty.
+
+    colour_managed: False after a draw that had to fall back to the overlays' buffer, with `fallback` saying why.
+    """
+
+    enabled: bool = False
+    objects: int = 0
+    colour_managed: bool = True
+    fallback: str = ""
+    error: str = ""
+
+
+@dataclass
+class _Viewport:
+    """Everything that lives between `enable` and `disable`."""
+
+    get_draw_list: GetDrawList
+    handlers: list[tuple[Any, type]] = field(default_factory=list)
+    cache: DrawingCache = field(default_factory=DrawingCache)
+    framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
+    status: ViewportStatus = field(default_factory=lambda: ViewportStatus(enabled=True))
+
+
+_active: _Viewport | None = None
+
+
+def enable(get_draw_list: GetDrawList) -> None:
+    """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the list is replaced.
+
+    get_draw_list runs on every redraw of every region, with bpy.context of that region: it must be cheap, and may
+    raise PRTError, which `status()` then shows.
+    """
+    global _active
+    if _active is not None:
+        _active.get_draw_list = get_draw_list
+    else:
+        _active = _Viewport(get_draw_list)
+        for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW")):
+            handle = bpy.types.SpaceView3D.draw_handler_add(handler, (), "WINDOW", phase)
+            _active.handlers.append((handle, bpy.types.SpaceView3D))
+    redraw()
+
+
+def disable() -> None:
+    """Stop drawing and free every GPU object. Does nothing when not enabled."""
+    global _active
+    if _active is None:
+        return
+    for handle, space in _active.handlers:
+        space.draw_handler_remove(handle, "WINDOW")
+    _active.cache.clear()
+    _active = None
+    programs.release()
+    redraw()
+
+
+def is_enabled() -> bool:
+    """Whether the handlers are in place."""
+    return _active is not None
+
+
+def status() -> ViewportStatus:
+    """The state of the preview after the last redraw."""
+    return ViewportStatus() if _active is None else _active.status
+
+
+def redraw() -> None:
+    """Ask every 3D viewport to redraw; call it when the light or the draw list changed."""
+    for window in bpy.context.window_manager.windows if bpy.context.window_manager else ():
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+def _remember_framebuffer() -> None:
+    """PRE_VIEW: keep the framebuffer of the region's scene-linear picture until POST_VIEW of the same redraw."""
+    region = bpy.context.region
+    if _active is not None and region is not None:
+        _active.framebuffers[region.as_pointer()] = gpu.state.active_framebuffer_get()
+
+
+def _draw_region() -> None:
+    """POST_VIEW: draw the list into the region."""
+    viewport, region, space = _active, bpy.context.region, bpy.context.space_data
+    if viewport is None or region is None:
+        return
+    framebuffer = viewport.framebuffers.pop(region.as_pointer(), None)
+    if space.shading.type == "WIREFRAME":  # a filled surface would hide what the user asked to see
+        return
+    try:
+        items = viewport.get_draw_list()
+        viewport.cache.keep_only({item.key for item in items})
+        _draw_items(viewport, items, framebuffer)
+        viewport.status.objects, viewport.status.error = len(items), ""
+    except PRTError as error:  # nobody can catch it here; the panel shows it
+        viewport.status.objects, viewport.status.error = 0, str(error)
+
+
+def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu.types.GPUFrameBuffer | None) -> None:
+    """Draw into the scene-linear picture, or over the overlays where that can't be had."""
+    if not items:
+        return
+    view_projection = np.array(bpy.context.region_data.perspective_matrix, np.float64)
+    reason = _why_not_usable(framebuffer, bpy.context.region)
+    viewport.status.colour_managed, viewport.status.fallback = not reason, reason
+    if reason:
+        viewport.cache.draw(items, view_projection)
+        return
+    with framebuffer.bind():
+        if _depth_is_missing(bpy.context.space_data):
+            framebuffer.clear(depth=1.0)
+        viewport.cache.draw(items, view_projection)
+
+
+def _why_not_usable(framebuffer: gpu.types.GPUFrameBuffer | None, region: bpy.types.Region) -> str:
+    """Empty if the remembered framebuffer can be drawn to, else the reason."""
+    if framebuffer is None:
+        return "Blender announced no picture for this viewport"
+    try:
+        with framebuffer.bind():
+            _, _, width, height = framebuffer.viewport_get()
+    except (ReferenceError, RuntimeError, SystemError) as error:
+        return f"the viewport's picture can't be bound ({error})"
+    if (width, height) != (region.width, region.height):
+        return f"the picture has {width}x{height} pixels, the viewport {region.width}x{region.height}"
+    return ""
+
+
+def _depth_is_missing(space: bpy.types.SpaceView3D) -> bool:
+    """Whether the picture's depth is not the scene's.
+
+    With overlays on they render it themselves. With overlays off, EEVEE leaves 0 everywhere (nothing would pass) and
+    Cycles 1; Workbench writes its own. Where it is missing, other objects can't hide the baked ones.
+    """
+    return space.shading.type in {"MATERIAL", "RENDERED"} and not space.overlay.show_overlays

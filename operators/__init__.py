@@ -1,0 +1,11 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators and commands. Rule: each gathers its input, calls one function, and maps PRTError to a report.
+
+    properties.py      what the user sets (Scene.prt) and what panels show of this session (WindowManager.prt)
+    bake_session.py    one bake from a scene to stored data, around the child process: for the operator and the command
+    job_mixin.py       the one place that knows modal timers, Esc, status text and progress
+    bake.py            prt.bake, prt.cancel        clear.py    prt.clear        analyze.py    prt.analyze
+    preview.py         prt.toggle_preview
+    live_preview.py    what the viewport draws, and the handlers that make it follow the scene and its light
+    commands.py        the command line: `main(arguments) -> int`; verbs.py: what each verb does
+"""

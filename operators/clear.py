@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""prt.clear: remove baked data."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..prt_addon.blender.stored import baked_objects, clear_baked
+from ..prt_addon.errors import PRTError
+from . import live_preview
+from .properties import assign, session
+
+
+class PRT_OT_clear(bpy.types.Operator):
+    """Remove the baked data of the selected objects (of all objects when none of the selected is baked).
+    Meshes, materials and lights are not touched"""
+
+    bl_idname = "prt.clear"
+    bl_label = "Clear Bake"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if session(context).running:
+            cls.poll_message_set("A bake is running: cancel it first")
+            return False
+        if not session(context).objects and not bpy.app.background:
+            cls.poll_message_set("Nothing is baked")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            baked = baked_objects(context.scene)
+            chosen = [o for o in baked if o.select_get()] or baked
+            for baked_object in chosen:
+                clear_baked(baked_object)
+        except PRTError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        text = f"Cleared the bake of {len(chosen)} object{'' if len(chosen) == 1 else 's'}"
+        assign(session(context), message=text, failed=False, seconds=-1.0)
+        live_preview.bakes_changed()
+        self.report({"INFO"}, text)
+        return {"FINISHED"}

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the viewport draws, and the handlers that make it follow the scene and its light.
+
+Handlers only note that something changed; a timer does the work soon after, so that dragging a Sun stays smooth: it
+waits at least as long as the last evaluation of the light took. Objects are kept by name: undo invalidates references.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+from bpy.app.handlers import persistent
+from numpy.typing import NDArray
+
+from ..gpu_shaders import viewport
+from ..gpu_shaders.render_data import DrawItem, transfer_signature
+from ..prt_addon.basis.spherical_harmonics import order_of, rotate
+from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.stored import baked_objects, read_baked, stale
+from ..prt_addon.errors import PRTError
+from ..prt_addon.storage.container import BakedTransfer
+from .properties import assign, session
+
+SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
+STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
+LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
+               bpy.types.Collection)
+
+
+@dataclass
+class Shown:
+    """One baked object as it was read; the rest of its DrawItem is looked up on every redraw."""
+
+    baked: BakedTransfer
+    key: Hashable
+    to_bake: NDArray[np.float64]  # (4, 4) from world space to the object's space when baked
+    stale: bool = False
+
+
+@dataclass
+class Live:
+    """Everything that the handlers share."""
+
+    shown: dict[str, Shown] = field(default_factory=dict)
+    light: NDArray[np.float64] | None = None
+    light_version: int = 0
+    signature: Hashable = None
+    rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
+    light_seconds: float = 0.0
+    bakes_dirty: bool = True
+    light_dirty: bool = True
+    stale_dirty: bool = True
+    working: bool = False
+
+
+_live = Live()
+
+
+def bakes_changed() -> None:
+    """Baked data was written or removed: read it again soon."""
+    _live.bakes_dirty = _live.light_dirty = _live.stale_dirty = True
+    _schedule(SHORTEST_WAIT)
+
+
+def enable() -> None:
+    """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
+    _read_bakes()
+    _read_light()
+    viewport.enable(draw_list)
+    assign(session(), preview=True, preview_message="")
+
+
+def disable() -> None:
+    """Back to Blender's own picture."""
+    viewport.disable()
+    assign(session(), preview=False, preview_message="")
+
+
+def draw_list() -> list[DrawItem]:
+    """What one region draws now: called on every redraw, so it only looks things up."""
+    if _live.light is None:
+        return []
+    space, exposure = bpy.context.space_data, 2.0 ** bpy.context.scene.prt.exposure
+    items = []
+    for name, shown in _live.shown.items():
+        found = bpy.data.objects.get(name)
+        if found is None or found.mode != "OBJECT" or not found.visible_in_viewport_get(space):
+            continue
+        moved = np.array(found.matrix_world, np.float64) @ shown.to_bake  # small
+        items.append(DrawItem(shown.key, shown.baked, moved, _light_in(moved), exposure, shown.stale))
+    return items
+
+
+def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
+    scale = np.sqrt((moved[:3, :3] ** 2).sum(axis=0))
+    turn = moved[:3, :3] / np.where(scale > 0.0, scale, 1.0)
+    if np.abs(turn - np.eye(3)).max() < 1e-5 or np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:  # small
+        return _live.light  # not turned, or sheared: then the bake is stale anyway
+    key = turn.round(6).tobytes()
+    if key not in _live.rotated:
+        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: rotate(_live.light.T, turn.T).T}
+    return _live.rotated[key]
+
+
+def _read_bakes() -> None:
+    """Read all baked objects of the scene; what can't be read is not shown, and the panel says why."""
+    scene, state = bpy.context.scene, session()
+    _live.bakes_dirty, _live.shown = False, {}
+    state.objects.clear()
+    for found in baked_objects(scene):
+        line = state.objects.add()
+        line.name = found.name
+        try:
+            baked = read_baked(found)
+        except PRTError as error:
+            line.stale = str(error)
+            continue
+        if baked is None:
+            continue
+        line.clusters, line.points = int(baked.bases.shape[0]), len(baked.cluster)
+        line.error = float(baked.header.get("errors", {}).get("total", -1.0))
+        to_bake = np.linalg.inv(np.reshape(baked.header["matrix"], (4, 4)))  # small
+        _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)), to_bake)
+    _read_stale()
+
+
+def _read_stale() -> None:
+    """Compare the baked objects with what they were baked from."""
+    _live.stale_dirty = False
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    for line in session().objects:
+        found, shown = bpy.data.objects.get(line.name), _live.shown.get(line.name)
+        if found is None or shown is None:
+            continue
+        why = stale(found, depsgraph) or ""
+        shown.stale = bool(why)
+        assign(line, stale=why)
+
+
+def _read_light() -> None:
+    """Evaluate the scene's light when it changed; the viewport redraws only then."""
+    _live.light_dirty = False
+    order = max((order_of(shown.baked.columns) for shown in _live.shown.values()), default=0)
+    if order == 0:
+        _live.light = None
+        return
+    started = time.perf_counter()
+    light = light_coefficients(bpy.context.scene, bpy.context.evaluated_depsgraph_get(), order)
+    _live.light_seconds = time.perf_counter() - started
+    assign(session(), preview_message="\n".join(light.warnings))
+    if (order, light.signature) != _live.signature:
+        _live.signature, _live.light, _live.rotated = (order, light.signature), light.coefficients, {}
+        viewport.redraw()
+
+
+def _schedule(wait: float) -> None:
+    if not bpy.app.background and not bpy.app.timers.is_registered(_catch_up):
+        bpy.app.timers.register(_catch_up, first_interval=wait)
+
+
+def _catch_up() -> None:
+    """Do what the handlers asked for."""
+    windows = bpy.context.window_manager.windows
+    if not windows:
+        return
+    _live.working = True
+    try:
+        with bpy.context.temp_override(window=windows[0]):
+            if _live.bakes_dirty:
+                _read_bakes()
+            if _live.stale_dirty:
+                _read_stale()
+            if _live.light_dirty and session().preview:
+                _read_light()
+    except PRTError as error:
+        assign(session(), preview_message=str(error))
+    finally:
+        _live.working = False
+    viewport.redraw()
+
+
+@persistent
+def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Note whether the light or a baked mesh changed."""
+    if _live.working or not _live.shown:
+        return
+    for update in depsgraph.updates:
+        changed = update.id
+        if isinstance(changed, LIGHT_TYPES):
+            _live.light_dirty = True
+        elif isinstance(changed, bpy.types.Object):
+            _live.light_dirty |= changed.type == "LIGHT"
+            _live.stale_dirty |= changed.type == "MESH"
+    if _live.light_dirty and session().preview:
+        _schedule(max(SHORTEST_WAIT, _live.light_seconds))
+    elif _live.stale_dirty:
+        _schedule(STALE_WAIT)
+
+
+@persistent
+def _on_frame_change(_scene: bpy.types.Scene, _depsgraph: bpy.types.Depsgraph) -> None:
+    """An animated light moves without a depsgraph update of its own."""
+    _live.light_dirty = True
+    if session().preview:
+        _schedule(max(SHORTEST_WAIT, _live.light_seconds))
+
+
+@persistent
+def _on_data_replaced(*_arguments: object) -> None:
+    """A file was loaded, or undo replaced all data."""
+    _live.signature = None
+    bakes_changed()
+
+
+HANDLERS = (
+    (bpy.app.handlers.depsgraph_update_post, _on_depsgraph_update),
+    (bpy.app.handlers.frame_change_post, _on_frame_change),
+    (bpy.app.handlers.undo_post, _on_data_replaced),
+    (bpy.app.handlers.redo_post, _on_data_replaced),
+    (bpy.app.handlers.load_post, _on_data_replaced),
+)
+
+
+def register() -> None:
+    """Attach the handlers."""
+    for handlers, handler in HANDLERS:
+        handlers.append(handler)
+    bakes_changed()
+
+
+def unregister() -> None:
+    """Leave no handler, timer or GPU object behind."""
+    for handlers, handler in HANDLERS:
+        handlers.remove(handler)
+    if bpy.app.timers.is_registered(_catch_up):
+        bpy.app.timers.unregister(_catch_up)
+    viewport.disable()
+    _live.shown.clear()

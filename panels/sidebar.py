@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The 3D viewport's sidebar tab "PRT": what to bake, how it goes, what came out."""
+
+from __future__ import annotations
+
+import textwrap
+
+import bpy
+
+CHARACTERS_PER_WIDTH = 0.135  # of the interface font at scale 1, per pixel of region width
+MARGIN = 60  # pixels of a region that hold no text: icon, borders
+
+
+class _Sidebar:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "PRT"
+
+
+class PRT_PT_bake(_Sidebar, bpy.types.Panel):
+    """Targets, settings, the bake and its progress."""
+
+    bl_idname = "PRT_PT_bake"
+    bl_label = "Bake"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings, session = self.layout, context.scene.prt, context.window_manager.prt
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.label(text=_targets(context), icon="MESH_DATA")
+        column = layout.column()
+        column.enabled = not session.running
+        column.prop(settings, "preset")
+        column.prop(settings, "order")
+        column.prop(settings, "bounces")
+        if session.running:
+            layout.progress(factor=session.fraction, text=_progress(session))
+            layout.operator("prt.cancel", icon="CANCEL")
+        else:
+            row = layout.row(align=True)
+            row.operator("prt.bake", text="Bake", icon="RENDER_STILL")
+            row.operator("prt.analyze", icon="VIEWZOOM")
+        if session.message:
+            _wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
+        if session.analysis:
+            box = layout.box()
+            for line in session.analysis.splitlines():
+                _wrapped(box, context, line)
+
+
+class PRT_PT_preview(_Sidebar, bpy.types.Panel):
+    """The viewport's picture under the present light."""
+
+    bl_idname = "PRT_PT_preview"
+    bl_label = "Preview"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, session = self.layout, context.window_manager.prt
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.operator("prt.toggle_preview", text="Relight in Viewport", icon="SHADING_RENDERED",
+                        depress=session.preview)
+        column = layout.column()
+        column.active = session.preview
+        column.prop(context.scene.prt, "exposure")
+        for line in session.preview_message.splitlines():
+            _wrapped(layout, context, line, "INFO")
+
+
+class PRT_PT_results(_Sidebar, bpy.types.Panel):
+    """Baked objects, with a warning where one was edited since."""
+
+    bl_idname = "PRT_PT_results"
+    bl_label = "Baked Objects"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, session = self.layout, context.window_manager.prt
+        if not session.objects:
+            layout.label(text="Nothing is baked yet", icon="INFO")
+            return
+        if session.seconds >= 0.0:
+            layout.label(text=f"Baked in {session.seconds:.1f} s", icon="TIME")
+        for line in session.objects:
+            box = layout.box()
+            box.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
+            if line.points:
+                box.label(text=f"{line.points:,} receivers, {line.clusters} clusters")
+            if line.error >= 0.0:
+                box.label(text=f"Error {100.0 * line.error:.2f} %")
+            if line.stale:
+                _wrapped(box, context, line.stale, alert=True)
+        layout.operator("prt.clear", icon="TRASH")
+
+
+def _targets(context: bpy.types.Context) -> str:
+    count = sum(o.type == "MESH" for o in context.selected_objects)
+    return "All visible meshes" if count == 0 else f"{count} selected mesh{'' if count == 1 else 'es'}"
+
+
+def _progress(session: bpy.types.PropertyGroup) -> str:
+    text = f"{session.stage}  {100.0 * session.fraction:.0f} %"
+    return text if session.seconds_left < 0.0 else f"{text}, {session.seconds_left:.0f} s left"
+
+
+def _wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE",
+             alert: bool = False) -> None:
+    """A text over as many lines as the sidebar's width asks for: labels are clipped otherwise."""
+    scale = context.preferences.system.ui_scale
+    width = max(16, int((context.region.width - MARGIN * scale) * CHARACTERS_PER_WIDTH / scale))
+    column = layout.column(align=True)
+    column.alert = alert
+    for number, line in enumerate(textwrap.wrap(text, width)):
+        column.label(text=line, icon=icon if number == 0 else "BLANK1" if icon != "NONE" else "NONE")

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The error budget of a bake: where the difference from the truth comes from, measured at random receivers.
+
+sampling: finite directions and gather rays, at the bake's own order of lighting; basis: light detail above that order;
+compression: clustered PCA; total: what is drawn against the full light. Each is a relative RMS of exit radiance over
+receivers and channels, under the scene's light, against independent paths, with a 95 % bootstrap interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..basis.spherical_harmonics import evaluate
+from ..lighting.reference_light import ReferenceLight
+from ..linear_algebra import multiply
+from ..scene.scene_mesh import SceneMesh
+from ..tracing.tracer import Tracer
+from ..transport.path_reference import DistantSuns, reference_radiance
+from ..transport.receiver_set import ReceiverSet
+
+RESAMPLES = 400
+
+
+@dataclass(frozen=True)
+class BakedSample:
+    """What the bake says at r random receivers, all float64: transfer (r, columns, channels) before and after
+    compression; keys: which receivers."""
+
+    keys: NDArray[np.int64]
+    transfer: NDArray[np.float64]
+    compressed: NDArray[np.float64]
+
+
+def choose_receivers(candidates: NDArray[np.int64], count: int, seed: int) -> NDArray[np.int64]:
+    """`count` of the candidate keys at random, sorted; all where there are fewer."""
+    generator = np.random.Generator(np.random.PCG64([seed, 77]))
+    if len(candidates) <= count:
+        return np.sort(candidates)
+    return np.sort(generator.choice(candidates, count, replace=False))
+
+
+def error_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], sample: BakedSample,
+                 light: ReferenceLight, order: int, bounces: int, paths: int, seed: int,
+                 ) -> Generator[float, None, dict[str, Any]]:
+    """Yield progress, return {"sampling", "basis", "compression", "total"}: see `_entry` for each value's fields."""
+    receivers = ReceiverSet.of_keys(scene, tracer, sample.keys)
+    place = np.searchsorted(sample.keys, receivers.key)  # reference receivers are in Morton order
+    coefficients = light.coefficients(order)
+
+    def emission(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        banded = multiply(evaluate(order, directions), coefficients)
+        return np.stack([banded, light.radiance(directions)], axis=1)
+
+    suns = DistantSuns(light.sun_directions, light.sun_irradiance)
+    before = tracer.rays
+    halves = yield from reference_radiance(tracer, scene, receivers, albedo, emission, suns, paths, bounces, seed)
+    rays = tracer.rays - before
+    banded, full = halves[:, :, 0], halves[:, :, 1]
+    baked = _lit(sample.transfer[place], coefficients)
+    drawn = _lit(sample.compressed[place], coefficients)
+    pair = (banded[0], banded[1])
+    return {
+        "sampling": _entry(baked, baked, pair, rays, seed),
+        "basis": _difference_entry(banded, full, rays, seed),
+        "compression": _entry(drawn, drawn, (baked, baked), 0, seed),
+        "total": _entry(drawn, drawn, (full[0], full[1]), rays, seed),
+    }
+
+
+def _lit(transfer: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Radiance (r, 3) of transfer (r, columns, channels) under light (columns, 3)."""
+    return np.sum(transfer * light[None], axis=1)
+
+
+def _entry(first: NDArray[np.float64], second: NDArray[np.float64], truth: tuple[NDArray[np.float64], ...], rays: int,
+           seed: int) -> dict[str, Any]:
+    """Relative RMS of (first - truth) with its interval, from two independent estimates of the truth."""
+    squared = np.sum((first - truth[0]) * (second - truth[1]), axis=1)
+    return _summary(squared, np.sum(truth[0] * truth[1], axis=1), rays, seed)
+
+
+def _difference_entry(banded: NDArray[np.float64], full: NDArray[np.float64], rays: int, seed: int) -> dict[str, Any]:
+    """As `_entry`, for two lightings seen along the same paths, whose noise is largely shared."""
+    difference = banded - full
+    return _summary(np.sum(difference[0] * difference[1], axis=1), np.sum(full[0] * full[1], axis=1), rays, seed)
+
+
+def _summary(squared: NDArray[np.float64], power: NDArray[np.float64], rays: int, seed: int) -> dict[str, Any]:
+    """{"relative_rms", "interval" (95 %), "receivers", "reference_rays"} of per-receiver squared errors and powers."""
+    generator = np.random.Generator(np.random.PCG64([seed, 78]))
+    picks = generator.integers(0, len(squared), (RESAMPLES, len(squared)))
+    low, high = np.percentile([_relative(squared[p], power[p]) for p in picks], (2.5, 97.5))
+    return {"relative_rms": _relative(squared, power), "interval": [float(low), float(high)],
+            "receivers": len(squared), "reference_rays": int(rays)}
+
+
+def _relative(squared: NDArray[np.float64], power: NDArray[np.float64]) -> float:
+    """sqrt(sum of squares / power). The unbiased estimate of a tiny square may fall below zero: that reads as 0, with
+    the interval's upper end saying how little is known. No power at all (black) has no relative error: 0."""
+    total = float(power.sum())
+    return float(np.sqrt(max(float(squared.sum()), 0.0) / total)) if total > 0.0 else 0.0

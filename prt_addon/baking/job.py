@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Job folders: a bake's input, its finished stages and its result, so that an interrupted bake resumes.
+
+The folder's name holds a digest of the scene and the settings: the same job finds its stages again, any other starts
+afresh.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Generator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import StorageError
+from ..lighting.reference_light import ReferenceLight
+from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..storage.container import BakedTransfer, check_header
+from ..storage.digests import digest_arrays, digest_json
+from ..storage.files import load_arrays, save_arrays
+from .recipe import BakeResult, Progress, bake
+from .settings import BakeSettings
+
+# Raised whenever the same input would give other numbers, so that old stages are not mixed with new code.
+JOB_SCHEMA = 1
+SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
+_SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose")
+_CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
+
+
+def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
+              digests: dict[str, str] | None = None) -> Path:
+    """Write the input of a bake into its folder below `root` and return the folder; finished stages there stay.
+
+    digests: of the geometry by object name, kept in the headers. Raises StorageError where `root` can't be written.
+    """
+    arrays = {name: getattr(scene, name) for name in _SCENE_ARRAYS}
+    header = {
+        "schema": JOB_SCHEMA,
+        "objects": [_object_header(o) for o in scene.objects],
+        "warnings": list(scene.warnings),
+        "settings": settings.as_dict(),
+        "geometry_digests": digests or {},
+        "light": None,
+    }
+    if light is not None:
+        arrays |= {f"light_{name}": value for name, value in light.arrays().items()}
+        header["light"] = light.header()
+    name = digest_json([digest_arrays(*(np.asarray(arrays[key]) for key in sorted(arrays))), header])
+    folder = root / f"bake-{name[:24]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(str(folder), f"the job folder can't be made ({error.strerror})",
+                           "Choose a folder that can be written") from error
+    if not (folder / SCENE_FILE).exists():
+        save_arrays(folder / SCENE_FILE, arrays, header)
+    return folder
+
+
+def _object_header(scene_object: SceneObject) -> dict[str, Any]:
+    entry = asdict(scene_object)
+    entry["points"] = [scene_object.points.start, scene_object.points.stop]
+    entry["triangles"] = [scene_object.triangles.start, scene_object.triangles.stop]
+    entry["matrix"] = np.asarray(scene_object.matrix, np.float64).ravel().tolist()
+    return entry
+
+
+def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | None, dict[str, str]]:
+    """The input written by `write_job`. Raises StorageError."""
+    arrays, header = load_arrays(folder / SCENE_FILE)
+    objects = tuple(
+        SceneObject(**{**entry, "points": slice(*entry["points"]), "triangles": slice(*entry["triangles"]),
+                       "matrix": np.reshape(entry["matrix"], (4, 4))})
+        for entry in header["objects"])
+    scene = SceneMesh(**{name: arrays[name] for name in _SCENE_ARRAYS}, objects=objects,
+                      warnings=tuple(header["warnings"]))
+    light = None
+    if header["light"] is not None:
+        stored = {name[len("light_"):]: value for name, value in arrays.items() if name.startswith("light_")}
+        light = ReferenceLight.from_arrays(stored, header["light"])
+    return scene, BakeSettings(**header["settings"]), light, header["geometry_digests"]
+
+
+def run_job(folder: Path) -> Generator[Progress, None, None]:
+    """Bake a job, resuming after its finished stages, and leave the result in its folder."""
+    if (folder / RESULT_FILE).exists():
+        return
+    scene, settings, light, digests = read_job(folder)
+    result = yield from bake(scene, settings, folder, light, digests)
+    arrays = {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
+              for name in _CONTAINER_ARRAYS}
+    headers = [container.header for container in result.objects.values()]
+    save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
+                                               "report": result.report})
+
+
+def read_result(folder: Path) -> BakeResult:
+    """The complete, checked result of a job. Raises StorageError where there is none."""
+    arrays, stored = load_arrays(folder / RESULT_FILE)
+    objects = {}
+    for index, (name, header) in enumerate(zip(stored["names"], stored["headers"], strict=True)):
+        parts = [arrays[f"{index}_{part}"] for part in _CONTAINER_ARRAYS]
+        container = BakedTransfer(check_header(header, name), *parts)
+        if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
+            raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
+        objects[name] = container
+    return BakeResult(objects, stored["report"])
+
+
+def discard(folder: Path) -> None:
+    """Remove a job folder, once its result has been applied or it is not wanted any more."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def job_summary(folder: Path) -> dict[str, Any]:
+    """{"finished": names of finished stages, "complete": whether the result is there} of a job folder."""
+    finished = sorted(p.stem for p in folder.glob("*.npz") if p.name not in (SCENE_FILE, RESULT_FILE))
+    return {"finished": finished, "complete": (folder / RESULT_FILE).exists()}

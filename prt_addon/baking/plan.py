@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a bake will do, how long it will take and how much memory: known before the first ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..lighting.reference_light import ReferenceLight
+from ..scene.needs import Needs, decide
+from ..scene.scene_mesh import SceneMesh
+from .settings import BakeSettings
+
+# Orders of magnitude measured on two cores (benchmarks/tracing.py); used for the forecast and the progress bar only,
+# which corrects itself by the time that stages really took.
+SHADOW_RAYS_PER_SECOND = 3.5e6
+GATHER_RAYS_PER_SECOND = 1.2e6
+PATH_RAYS_PER_SECOND = 0.8e6
+SECONDS_PER_BOUNCED_VALUE = 2e-8
+SECONDS_PER_ENCODED_VALUE = 1.2e-8
+BYTES_PER_RAY_HIT = 24
+# The part of a hemisphere that shows surfaces, before anything is traced: between an open statue and a room.
+TYPICAL_HIT_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """needs: what the scene needs; receivers: baked; seconds: expected for each stage that will run; rays: expected
+    for each; peak_bytes, stored_bytes: expected."""
+
+    needs: Needs
+    receivers: int
+    seconds: dict[str, float]
+    rays: dict[str, int]
+    peak_bytes: int
+    stored_bytes: int
+
+
+def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None) -> Plan:
+    """The plan of a bake, from counts alone."""
+    loose = scene.loose
+    receivers = sum(int((~loose[o.points]).sum()) for o in scene.objects if o.is_target)
+    shadow, gather = receivers * settings.directions // 2, receivers * settings.gather_directions // 2
+    needs = decide(scene, settings.order, settings.bounces, (shadow, gather),
+                   light.highest_order(settings.order) if light is not None else None, settings.fit_order_to_light)
+    columns = needs.order ** 2
+    values = receivers * columns * needs.channels
+    seconds, rays = {"prepare": 0.2 + 1e-6 * len(scene.triangles)}, {}
+    if needs.bounces:
+        rays["gather"] = gather
+        seconds["gather"] = gather / GATHER_RAYS_PER_SECOND
+    rays["direct"] = shadow if needs.shadow_rays else 0
+    seconds["direct"] = rays["direct"] / SHADOW_RAYS_PER_SECOND + 1e-8 * values
+    if needs.bounces:
+        seconds["interreflection"] = values * settings.gather_directions * 0.02 * SECONDS_PER_BOUNCED_VALUE + 0.05
+    seconds["encode"] = 0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
+    if settings.error_receivers:
+        rays["errors"] = 2 * settings.error_receivers * settings.error_paths
+        seconds["errors"] = 0.1 + rays["errors"] / PATH_RAYS_PER_SECOND
+    operator = gather * TYPICAL_HIT_SHARE * BYTES_PER_RAY_HIT if needs.bounces else 0
+    stored = receivers * 4 * (1 + 4 * -(-settings.vectors // 4) + 4) + 4 * settings.clusters * (
+        settings.vectors + 1) * columns * needs.channels
+    peak = int(2e8 + 150 * len(scene.triangles) + operator + 4 * 4 * values)
+    return Plan(needs, receivers, seconds, rays, peak, int(stored))
+
+

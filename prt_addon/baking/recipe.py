@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The recipe of a bake: scene -> transfer -> encoding -> container and report, as one generator of progress.
+
+Exhausting the generator is a bake, closing it a cancel. With a job folder, each finished stage is written there, and a
+later run of the same job starts after the last one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillRunning
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from ..basis.directions import quadrature
+from ..compression.encoding import Encoding, encode
+from ..compression.settings import EncoderSettings
+from ..errors import Cancelled
+from ..lighting.reference_light import ReferenceLight, stand_in_light
+from ..reporting.stages import StageTimer
+from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..storage.container import BakedTransfer
+from ..storage.files import load_arrays, save_arrays
+from ..tracing.tracer import Tracer
+from ..transport.direct import direct_transfer, unshadowed_transfer
+from ..transport.gather import Gather, gather_operator
+from ..transport.interreflection import Interreflection, interreflect, limited_albedo
+from ..transport.receiver_set import ReceiverSet
+from .error_budget import BakedSample, choose_receivers, error_budget
+from .plan import Plan, make_plan
+from .results import object_container, report_of, stability_of
+from .settings import BakeSettings
+
+POLL_SECONDS = 0.05
+
+
+@dataclass(frozen=True)
+class Progress:
+    """stage: its name; fraction: of the whole bake, 0..1; rays: traced so far; seconds_left: None while unknown."""
+
+    stage: str
+    fraction: float
+    rays: int
+    seconds_left: float | None
+
+
+@dataclass(frozen=True)
+class BakeResult:
+    """objects: the container of each target by name; report: see design/contract.md."""
+
+    objects: dict[str, BakedTransfer]
+    report: dict[str, Any]
+
+
+Steps = Generator[Progress, None, Any]
+
+
+def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
+         light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
+         ) -> Generator[Progress, None, BakeResult]:
+    """Yield progress and return the result.
+
+    light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
+    in the headers. Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    """
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}).run())
+
+
+@dataclass
+class _Bake:
+    """The state of one bake, stage by stage."""
+
+    scene: SceneMesh
+    settings: BakeSettings
+    folder: Path | None
+    light: ReferenceLight | None
+    digests: dict[str, str]
+    resumed: list[str] = field(default_factory=list)
+
+    def run(self) -> Generator[Progress, None, BakeResult]:
+        """All stages in order."""
+        self.started = time.perf_counter()
+        self.rays_resumed = 0
+        self.tracer: Tracer | None = None
+        self.plan: Plan = make_plan(self.scene, self.settings, self.light)
+        self.timer = StageTimer(lambda: self.tracer.rays if self.tracer else 0)
+        self.stage_order = list(self.plan.seconds)
+        with self.timer.stage("prepare"):
+            yield self._progress("prepare", 0.0)
+            self._prepare()
+        gathered, bounced = None, None
+        if self.plan.needs.bounces:
+            with self.timer.stage("gather"):
+                gathered = yield from self._gather()
+        with self.timer.stage("direct"):
+            receivers, transfer = yield from self._direct(gathered)
+        if gathered is not None:
+            with self.timer.stage("interreflection"):
+                bounced = yield from self._interreflection(gathered, transfer)
+        with self.timer.stage("encode"):
+            transfer = self._by_point(receivers, transfer[:, :, None] if bounced is None else bounced.transfer)
+            encodings = yield from self._encode(transfer)
+        errors: dict[str, Any] = {}
+        if self.settings.error_receivers:
+            with self.timer.stage("errors"):
+                errors = yield from self._errors(transfer, encodings)
+        return self._result(gathered, bounced, transfer, encodings, errors)
+
+    def _progress(self, stage: str, fraction: float) -> Progress:
+        seconds = self.plan.seconds
+        before = sum(seconds[name] for name in self.stage_order[:self.stage_order.index(stage)])
+        overall = min(1.0, (before + min(max(fraction, 0.0), 1.0) * seconds[stage]) / sum(seconds.values()))
+        elapsed = time.perf_counter() - self.started
+        left = elapsed * (1.0 - overall) / overall if overall > 0.02 and elapsed > 0.5 else None
+        return Progress(stage, overall, self.tracer.rays if self.tracer else 0, left)
+
+    def _follow(self, stage: str, steps: Generator[float, None, Any]) -> Steps:
+        """Pass a fill's progress on and return its result."""
+        try:
+            while True:
+                yield self._progress(stage, next(steps))
+        except StopIteration as end:
+            return end.value
+        finally:
+            steps.close()
+
+    def _load(self, stage: str) -> tuple[dict[str, NDArray], dict[str, Any]] | None:
+        path = self.folder / f"{stage}.npz" if self.folder else None
+        if path is None or not path.exists():
+            return None
+        self.resumed.append(stage)
+        return load_arrays(path)
+
+    def _save(self, stage: str, arrays: dict[str, NDArray], header: dict[str, Any] | None = None) -> None:
+        if self.folder:
+            save_arrays(self.folder / f"{stage}.npz", arrays, header or {})
+
+    def _prepare(self) -> None:
+        settings = self.settings
+        self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
+        self.directions = quadrature(settings.directions, self.plan.needs.order)
+        self.gather_directions = quadrature(settings.gather_directions, 4)
+        self.albedo = limited_albedo(self.scene.albedo)
+        keep = np.zeros(len(self.scene.points), bool)
+        for target in self.targets:
+            keep[target.points] = True
+        self.keys = np.flatnonzero(keep & ~self.scene.loose)
+
+    @property
+    def targets(self) -> list[SceneObject]:
+        """The objects whose transfer is stored."""
+        return [o for o in self.scene.objects if o.is_target]
+
+    def _gather(self) -> Generator[Progress, None, Gather | None]:
+        """The gather operator, or None where no receiver sees a surface."""
+        stored = self._load("gather")
+        if stored is not None:
+            gathered = _unpack_gather(self.scene, self.tracer, *stored)
+        else:
+            gathered = yield from self._follow("gather", gather_operator(
+                self.tracer, self.scene, self.keys, *self.gather_directions, self.settings.rotation_group,
+                self.settings.seed))
+            self._save("gather", _packed_gather(gathered), {n: getattr(gathered, n) for n in GATHER_NUMBERS})
+        return gathered if gathered.matrix.nnz else None
+
+    def _direct(self, gathered: Gather | None) -> Generator[Progress, None, tuple[ReceiverSet, NDArray[np.float32]]]:
+        """The receivers and their shadowed transfer (r, columns)."""
+        order = self.plan.needs.order
+        receivers = gathered.receivers if gathered else ReceiverSet.of_keys(self.scene, self.tracer, self.keys)
+        stored = self._load("direct")
+        if stored is not None:
+            return receivers, stored[0]["transfer"]
+        if self.plan.needs.shadow_rays:
+            transfer = yield from self._follow("direct", direct_transfer(
+                self.tracer, receivers, *self.directions, order, self.settings.rotation_group, self.settings.seed))
+        else:
+            transfer = unshadowed_transfer(receivers.normals, order).astype(np.float32)
+        self._save("direct", {"transfer": transfer})
+        return receivers, transfer
+
+    def _interreflection(self, gathered: Gather, direct: NDArray[np.float32],
+                         ) -> Generator[Progress, None, Interreflection]:
+        stored = self._load("interreflection")
+        if stored is not None:
+            return Interreflection(stored[0]["transfer"], **stored[1])
+        point = gathered.receivers.key % len(self.scene.points)
+        bounced = yield from self._follow("interreflection", interreflect(
+            gathered.matrix, self.albedo[point][:, :self.plan.needs.channels], direct, self.settings.bounce_error,
+            self.settings.bounces))
+        numbers = {k: v for k, v in asdict(bounced).items() if k != "transfer"}
+        self._save("interreflection", {"transfer": bounced.transfer}, numbers)
+        return bounced
+
+    def _by_point(self, receivers: ReceiverSet, transfer: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Transfer (points, columns, channels) in the order of the scene's points, zero where there is none."""
+        result = np.zeros((len(self.scene.points), *transfer.shape[1:]), np.float32)
+        front = receivers.key < len(result)
+        result[receivers.key[front]] = transfer[front]
+        return result
+
+    def _encode(self, transfer: NDArray[np.float32]) -> Generator[Progress, None, dict[str, Encoding]]:
+        """Each target's encoding; a thread encodes while this one reports, so that a bake can be cancelled."""
+        encodings: dict[str, Encoding] = {}
+        targets = self.targets
+        for number, target in enumerate(targets):
+            signal = transfer[target.points][~self.scene.loose[target.points]]
+            state = _EncodeState()
+            with ThreadPoolExecutor(1) as pool:
+                future = pool.submit(encode, signal.reshape(len(signal), -1), self._encoder_settings(), None,
+                                     state.report)
+                try:
+                    while True:
+                        try:
+                            encodings[target.name] = future.result(POLL_SECONDS)
+                            break
+                        except StillRunning:
+                            yield self._progress("encode", (number + state.fraction) / len(targets))
+                finally:
+                    state.cancelled = True
+        return encodings
+
+    def _encoder_settings(self) -> EncoderSettings:
+        settings = self.settings
+        target = settings.compression_error ** 2 if settings.compression_error > 0.0 else None
+        return EncoderSettings(settings.clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
+                               vectors_limit=24 if settings.encoder == "adaptive" else None)
+
+    def _errors(self, transfer: NDArray[np.float32], encodings: dict[str, Encoding],
+                ) -> Generator[Progress, None, dict[str, Any]]:
+        settings, keys = self.settings, choose_receivers(self.keys, self.settings.error_receivers, self.settings.seed)
+        compressed = self._compressed(keys, encodings, transfer.shape[1:])
+        sample = BakedSample(keys, transfer[keys].astype(np.float64), compressed)
+        steps = error_budget(self.tracer, self.scene, self.albedo, sample, self.light or stand_in_light(),
+                             self.plan.needs.order, settings.bounces, settings.error_paths, settings.seed)
+        errors = yield from self._follow("errors", steps)
+        return errors
+
+    def _compressed(self, keys: NDArray[np.int64], encodings: dict[str, Encoding], shape: tuple[int, ...],
+                    ) -> NDArray[np.float64]:
+        """Decoded transfer (k, columns, channels) of the receivers `keys`."""
+        result = np.zeros((len(keys), *shape))
+        for target in self.targets:
+            inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
+            place = np.cumsum(~self.scene.loose[target.points]) - 1
+            rows = place[keys[inside] - target.points.start]
+            result[inside] = decoded(encodings[target.name], rows).reshape(len(inside), *shape)
+        return result
+
+    def _result(self, gathered: Gather | None, bounced: Interreflection | None, transfer: NDArray[np.float32],
+                encodings: dict[str, Encoding], errors: dict[str, Any]) -> BakeResult:
+        stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
+        report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, errors, stability, gathered,
+                           bounced, self.light, self.resumed, time.perf_counter() - self.started)
+        shape = (1, *transfer.shape[1:])
+        objects = {
+            target.name: object_container(self.scene, target, encodings[target.name], shape, self.settings, report,
+                                          self.digests.get(target.name, ""))
+            for target in self.targets
+        }
+        return BakeResult(objects, report)
+
+
+GATHER_NUMBERS = ("hit_share", "back_share", "lost_share", "two_sided")
+
+
+class _EncodeState:
+    """What the encoding thread and the reporting one tell each other."""
+
+    def __init__(self) -> None:
+        self.fraction = 0.0
+        self.cancelled = False
+
+    def report(self, fraction: float) -> None:
+        """Keep the fraction; raise Cancelled where the bake was closed."""
+        self.fraction = fraction
+        if self.cancelled:
+            raise Cancelled("bake", "cancelled while encoding", "Bake again to go on from the finished stages")
+
+
+def decoded(encoding: Encoding, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The signal (k, values) that an encoding stands for at some of its points."""
+    result = np.empty((len(rows), encoding.bases.shape[2]))
+    for place, row in enumerate(rows):
+        basis = encoding.bases[encoding.cluster[row]].astype(np.float64)
+        result[place] = basis[0] + np.sum(encoding.weights[row].astype(np.float64)[:, None] * basis[1:], axis=0)
+    return result
+
+
+def _packed_gather(gathered: Gather) -> dict[str, NDArray]:
+    matrix = gathered.matrix
+    return {"key": gathered.receivers.key, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+
+
+def _unpack_gather(scene: SceneMesh, tracer: Tracer, arrays: dict[str, NDArray], numbers: dict[str, Any]) -> Gather:
+    """A stored operator; its receivers are made anew, in the stored order."""
+    key = arrays["key"]
+    made = ReceiverSet.of_keys(scene, tracer, key)
+    place = np.empty(len(key), np.int64)
+    order = np.argsort(made.key)
+    place[np.argsort(key)] = order
+    receivers = ReceiverSet(made.key[place], made.origins[place], made.normals[place])
+    size = (len(key), len(key))
+    matrix = sparse.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=size)
+    return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS))
+
+
+def exhaust(steps: Iterator[Progress]) -> BakeResult:
+    """Run a bake to its end in this process (tests and scripts)."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value

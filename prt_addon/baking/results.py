@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a bake leaves: the container of each object, and the report with its checks."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..compression.coherence import overdraw
+from ..compression.encoding import Encoding
+from ..lighting.reference_light import ReferenceLight
+from ..reporting.stages import StageTimer
+from ..scene.needs import LeftOut
+from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..storage.container import BakedTransfer, make_header
+from ..storage.digests import digest_json
+from ..transport.gather import Gather
+from ..transport.interreflection import LARGEST_ALBEDO, Interreflection
+from .plan import Plan
+from .settings import BakeSettings
+
+REPORT_SCHEMA = 1
+# A white unit environment can light a surface to 1 at most; what is above is sampling error of the gather rays.
+ENERGY_LIMIT = 1.02
+# An object most of whose receivers see no sky and no surface that does is probably wound inwards.
+DARK_LIMIT = 0.5
+
+
+def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, shape: tuple[int, int, int],
+                     settings: BakeSettings, report: dict[str, Any], geometry_digest: str) -> BakedTransfer:
+    """The container of one target. shape: (rows, columns, channels). Loose points join cluster 0 with no weights."""
+    bases = encoding.bases.reshape(*encoding.bases.shape[:2], *shape)
+    count, solid = target.points.stop - target.points.start, ~scene.loose[target.points]
+    cluster = np.zeros(count, np.int32)
+    weights = np.zeros((count, encoding.weights.shape[1]), np.float32)
+    cluster[solid], weights[solid] = encoding.cluster, encoding.weights
+    order = round(shape[1] ** 0.5)
+    header = make_header(
+        bases.shape,
+        {"kind": "spherical_harmonics", "order": order, "condon_shortley": False},
+        {"kind": "constant"},
+        object=target.name,
+        vectors_per_cluster=[int(v) for v in encoding.vectors_per_cluster],
+        digests={"geometry": geometry_digest, "settings": digest_json(settings.as_dict())},
+        matches_source=target.matches_source,
+        source_points=target.source_points,
+        matrix=[float(v) for v in np.asarray(target.matrix).ravel()],
+        settings=settings.as_dict(),
+        errors={name: entry["relative_rms"] for name, entry in report["errors"].items()},
+        seconds=report["seconds"],
+    )
+    points = target.points
+    triangles = (scene.triangles[target.triangles] - points.start).astype(np.int32)
+    return BakedTransfer(header, cluster, weights, np.ascontiguousarray(bases, np.float32),
+                         np.ascontiguousarray(scene.albedo[points], np.float32),
+                         scene.points[points].astype(np.float32), scene.normals[points].astype(np.float32), triangles)
+
+
+def _check(check: str, value: float, limit: float, good: str, bad: str) -> dict[str, Any]:
+    """One line of the stability table: the value may be at most the limit."""
+    return {"check": check, "value": float(value), "limit": float(limit), "verdict": good if value <= limit else bad}
+
+
+def stability_of(scene: SceneMesh, transfer: NDArray[np.float32], keys: NDArray[np.int64], gathered: Gather | None,
+                 bounced: Interreflection | None, settings: BakeSettings) -> list[dict[str, Any]]:
+    """Checks that hold for every physically possible bake, with what it means where they do not."""
+    values = transfer[keys]
+    checks = [_check("values that are not finite", float((~np.isfinite(values)).sum()), 0.0, "ok",
+                     "broken: please report this scene")]
+    white = values[:, 0].max(axis=1, initial=0.0) * np.sqrt(4.0 * np.pi)
+    checks.append(_check("brightest receiver in a white unit environment", float(white.max(initial=0.0)), ENERGY_LIMIT,
+                         "ok", "more light than there is: raise gather_directions"))
+    for target in scene.objects:
+        if target.is_target:
+            mine = (keys >= target.points.start) & (keys < target.points.stop)
+            dark = float(np.mean(white[mine] < 1e-3)) if mine.any() else 0.0
+            checks.append(_check(f"receivers of {target.name} that no light reaches", dark, DARK_LIMIT, "ok",
+                                 "normals may point inwards: recalculate them"))
+    if gathered is not None:
+        checks.append(_check("bounce rays that met receivers left out", gathered.lost_share, 0.02, "ok",
+                             "bounced light is missing there: surfaces seen from behind, or many mirrors of backs"))
+    if bounced is not None:
+        limit = max(settings.bounce_error, 1e-12) if settings.bounces < 0 else 1.0
+        checks.append(_check(f"energy left after {bounced.steps} bounce products ({bounced.method})", bounced.residual,
+                             limit, "ok", "did not converge: lower the albedo of closed rooms"))
+        largest = float(scene.albedo.max(initial=0.0))
+        checks.append(_check("largest albedo", largest, LARGEST_ALBEDO, "ok",
+                             f"limited to {LARGEST_ALBEDO}: a closed room of it would never grow dark"))
+    return checks
+
+
+def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: StageTimer,
+              encodings: dict[str, Encoding], errors: dict[str, Any], stability: list[dict[str, Any]],
+              gathered: Gather | None, bounced: Interreflection | None, light: ReferenceLight | None,
+              resumed: list[str], seconds: float) -> dict[str, Any]:
+    """The report of design/contract.md, with what else a reader may want."""
+    left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
+    stages = timer.stages
+    rays = sum(int(stage["rays"]) for stage in stages)
+    return {
+        "schema": REPORT_SCHEMA,
+        "scene": {
+            "objects": [o.name for o in scene.objects if o.is_target],
+            "casters": len(scene.objects),
+            "receivers": plan.receivers,
+            "triangles": len(scene.triangles),
+            "warnings": list(scene.warnings),
+        },
+        "settings": settings.as_dict(),
+        "seconds": seconds,
+        "peak_bytes": max((int(stage["peak_bytes"]) for stage in stages), default=0),
+        "rays": rays,
+        "rays_per_second": rays / max(seconds, 1e-9),
+        "stages": stages,
+        "left_out": [asdict(item) for item in left_out],
+        "hints": list(plan.needs.hints),
+        "errors": errors,
+        "error_metric": "relative RMS of exit radiance over random receivers and channels, under "
+                        + (light.description if light is not None else "a stand-in sky (the scene has no light)"),
+        "clusters": _clusters(scene, encodings),
+        "bounces": None if bounced is None else {
+            "method": bounced.method, "count": bounced.bounces, "products": bounced.steps, "history": bounced.history},
+        "stability": stability,
+        "resumed": list(resumed),
+    }
+
+
+def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None, encodings: dict[str, Encoding],
+                    ) -> list[LeftOut]:
+    """What turned out not to be needed only after the first rays."""
+    found = []
+    if plan.needs.bounces and gathered is None:
+        found.append(LeftOut("bounces", "no gather ray hit a surface", "the interreflection stage"))
+    if gathered is not None and not gathered.two_sided and gathered.back_share > 0.0:
+        found.append(LeftOut("light on the backs of surfaces",
+                             f"backs fill {gathered.back_share:.2%} of the mean receiver's hemisphere",
+                             "a second receiver at each point seen from behind"))
+    for name, encoding in encodings.items():
+        used = len(encoding.vectors_per_cluster)
+        if used < settings.clusters:
+            found.append(LeftOut(f"{settings.clusters - used} of {settings.clusters} clusters of {name}",
+                                 "the asked compression error is reached without them, or receivers are few",
+                                 f"{1 - used / settings.clusters:.0%} of bases and of work per light change"))
+    return found
+
+
+def _clusters(scene: SceneMesh, encodings: dict[str, Encoding]) -> dict[str, Any]:
+    """The clusters of all objects together, and object by object."""
+    objects = {}
+    for target in scene.objects:
+        encoding = encodings.get(target.name) if target.is_target else None
+        if encoding is None:
+            continue
+        cluster = np.zeros(target.points.stop - target.points.start, np.int32)
+        cluster[~scene.loose[target.points]] = encoding.cluster
+        triangles = scene.triangles[target.triangles] - target.points.start
+        objects[target.name] = {
+            "count": len(encoding.vectors_per_cluster),
+            "vectors_mean": float(encoding.vectors_per_cluster.mean()),
+            "squared_error": float(encoding.squared_error),
+            "relative_error": float(encoding.relative_error),
+            "overdraw": float(overdraw(triangles, cluster)),
+            "receivers": len(encoding.cluster),
+            "history": [[float(t), stage, float(error)] for t, stage, error in encoding.history],
+        }
+    count = sum(o["count"] for o in objects.values())
+    receivers = max(1, sum(o["receivers"] for o in objects.values()))
+    return {
+        "count": count,
+        "vectors_mean": sum(o["count"] * o["vectors_mean"] for o in objects.values()) / max(1, count),
+        "squared_error": sum(o["squared_error"] for o in objects.values()),
+        "overdraw": sum(o["overdraw"] * o["receivers"] for o in objects.values()) / receivers,
+        "objects": objects,
+    }

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a bake is asked for: presets for artists, every number by name for scripts."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from ..compression.settings import METHODS
+from ..errors import BadArguments
+
+HIGHEST_ORDER = 10
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """Settings of a bake. What each buys and costs.
+
+    order: of the spherical harmonics (order^2 coefficients per receiver); higher = sharper shadows, more memory.
+    directions: shadow rays per receiver over the whole sphere (half are traced); error falls about as 1/directions^0.75.
+    gather_directions: rays over the sphere that carry bounced light.
+    bounces: of light; -1 = until less than bounce_error of the energy is left.
+    bounce_error: relative energy that may be left out of the bounces.
+    clusters, vectors: most clusters, and vectors per cluster, of the encoding (fewer where the signal needs fewer).
+    encoder: "static", "iterative" or "adaptive" (Sloan 2003, 4.1-4.3).
+    compression_error: relative RMS error of the encoding at which it stops; 0 uses all clusters and vectors.
+    spacing: longest triangle edge as a fraction of the baked objects' diagonal; coarser triangles are refined; 0 = off.
+    rotation_group: receivers that share one random rotation of the directions; 0 = all share one set, unrotated.
+    error_receivers, error_paths: receivers, and paths from each, of the reference that measures the error; 0 = none.
+    fit_order_to_light: lower the order to what the scene's present light carries.
+    threads: 0 = one per core. seed: of all random choices.
+    """
+
+    order: int = 5
+    directions: int = 1024
+    gather_directions: int = 256
+    bounces: int = -1
+    bounce_error: float = 1e-3
+    clusters: int = 256
+    vectors: int = 8
+    encoder: str = "iterative"
+    compression_error: float = 2e-3
+    spacing: float = 1.0 / 64.0
+    rotation_group: int = 0
+    error_receivers: int = 64
+    error_paths: int = 8192
+    fit_order_to_light: bool = False
+    threads: int = 0
+    seed: int = 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """All settings by name, as stored in report and header."""
+        return asdict(self)
+
+
+PRESETS: dict[str, BakeSettings] = {
+    "draft": BakeSettings(order=4, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
+                          encoder="static", compression_error=1e-2, spacing=1.0 / 32.0, error_receivers=32,
+                          error_paths=4096),
+    "standard": BakeSettings(),
+    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=256, vectors=12,
+                         encoder="adaptive", compression_error=5e-4, spacing=1.0 / 128.0, error_receivers=128,
+                         error_paths=16384),
+}
+
+# Inclusive limits of each number, and why there is a limit at all.
+_LIMITS: dict[str, tuple[float, float, str]] = {
+    "order": (1, HIGHEST_ORDER, "the conventions are tested to order 10"),
+    "directions": (16, 2 ** 20, "fewer see no shadow"),
+    "gather_directions": (16, 2 ** 16, "fewer see no bounce"),
+    "bounces": (-1, 1000, "-1 means as many as it takes"),
+    "bounce_error": (1e-7, 1.0, "single precision ends at 1e-7"),
+    "clusters": (1, 4096, "the shader's cluster table"),
+    "vectors": (0, 24, "six FLOAT4 attributes"),
+    "compression_error": (0.0, 1.0, "it is relative"),
+    "spacing": (0.0, 1.0, "it is a fraction of the diagonal"),
+    "rotation_group": (0, 2 ** 20, "0 means one set for all"),
+    "error_receivers": (0, 4096, "the reference is slow"),
+    "error_paths": (64, 2 ** 20, "fewer say nothing"),
+    "threads": (0, 1024, "0 means one per core"),
+    "seed": (0, 2 ** 31 - 1, "a non-negative number"),
+}
+
+
+def make_settings(preset: str, overrides: dict[str, str] | None = None) -> BakeSettings:
+    """Settings of a preset with overrides by name (texts, as on a command line). Raises BadArguments."""
+    if preset not in PRESETS:
+        raise BadArguments(f"preset {preset}", "there is no such preset", f"Use one of {', '.join(PRESETS)}")
+    known = {field.name: field.type for field in fields(BakeSettings)}
+    values: dict[str, Any] = {}
+    for name, text in (overrides or {}).items():
+        if name not in known:
+            raise BadArguments(f"setting {name}", "there is no such setting", f"Use one of {', '.join(known)}")
+        values[name] = _parsed(name, known[name], str(text))
+    return check(replace(PRESETS[preset], **values))
+
+
+def _parsed(name: str, kind: Any, text: str) -> Any:
+    """A setting's value from its text."""
+    try:
+        if kind == "bool":
+            return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[text.lower()]
+        return {"int": int, "float": float, "str": str}[kind](text)
+    except (ValueError, KeyError) as error:
+        expected = {"bool": "true or false", "int": "a whole number", "float": "a number", "str": "a word"}[kind]
+        raise BadArguments(f"setting {name}", f"{text!r} is not {expected}", f"Write {name}=VALUE") from error
+
+
+def check(settings: BakeSettings) -> BakeSettings:
+    """The settings themselves where all are within limits. Raises BadArguments."""
+    for name, (low, high, why) in _LIMITS.items():
+        value = getattr(settings, name)
+        if not low <= value <= high:  # also catches NaN
+            raise BadArguments(f"setting {name}", f"{value} is outside {low:g} to {high:g} ({why})", "Choose a value inside")
+    if settings.encoder not in METHODS:
+        raise BadArguments("setting encoder", f"{settings.encoder!r} is not an encoder", f"Use one of {', '.join(METHODS)}")
+    return settings

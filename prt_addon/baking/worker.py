@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The bake's child process: run by path as `python -I worker.py JOB --site FOLDER`, writes JSON lines on stdout.
+
+It is no part of the package while it starts (an isolated Python knows neither the extension nor its wheels), so it
+loads `prt_addon` from its own place on disk first. Threads are fine here: this is not Blender's process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import json
+import os
+import signal
+import site
+import sys
+import threading
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
+PROGRESS_SECONDS = 0.1  # between two progress lines of the same stage
+NICENESS = 5
+
+
+def load_package(folder: Path) -> ModuleType:
+    """Import the package in `folder` under its folder's name, without a search path."""
+    spec = importlib.util.spec_from_file_location(
+        folder.name, folder / "__init__.py", submodule_search_locations=[str(folder)]
+    )
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{folder} is no package")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[folder.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def emit(message_type: str, **values: Any) -> None:
+    """Write one message; the parent knows the closed set of types (process.MESSAGES)."""
+    sys.stdout.write(json.dumps({"type": message_type, **values}) + "\n")
+    sys.stdout.flush()
+
+
+def die_with_parent() -> None:
+    """End at once when the parent closes our input or dies: finished stages are on disk, so nothing is lost.
+
+    Its own thread, because the main thread may be inside a long call.
+    """
+
+    def watch() -> None:
+        sys.stdin.buffer.read()
+        os._exit(3)
+
+    threading.Thread(target=watch, daemon=True, name="parent watch").start()
+
+
+def be_polite() -> None:
+    """Ctrl-C is the parent's to handle; the artist's other programs go first (Windows: set by the parent)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+
+
+def run(job_folder: Path) -> int:
+    """Bake the job, with its result left in the folder. Returns the exit status."""
+    errors = importlib.import_module(f"{PACKAGE_FOLDER.name}.errors")
+    try:
+        job = importlib.import_module(f"{PACKAGE_FOLDER.name}.baking.job")
+        last_stage, last_time = None, 0.0
+        for progress in job.run_job(job_folder):
+            now = time.monotonic()
+            if progress.stage != last_stage or now - last_time >= PROGRESS_SECONDS:
+                last_stage, last_time = progress.stage, now
+                emit("progress", stage=progress.stage, fraction=float(progress.fraction), rays=int(progress.rays),
+                     seconds_left=None if progress.seconds_left is None else float(progress.seconds_left))
+    except errors.PRTError as error:
+        emit("error", subject=error.subject, cause=error.cause, remedy=error.remedy, exit_code=error.exit_code)
+        return error.exit_code
+    except MemoryError:
+        emit("error", subject="bake", cause="memory ran out",
+             remedy="Choose a lower order, fewer directions or fewer objects and bake again to resume", exit_code=1)
+        return 1
+    emit("done")
+    return 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("job", type=Path)
+    parser.add_argument("--site", required=True)
+    arguments = parser.parse_args()
+    site.addsitedir(arguments.site)
+    be_polite()
+    die_with_parent()
+    load_package(PACKAGE_FOLDER)
+    return run(arguments.job)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

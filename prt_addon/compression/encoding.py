@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The one entrance to compression: a signal in, clusters, bases and weights out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..linear_algebra import multiply
+from .adaptive import adapt, trim_vectors
+from .clustered_pca import iterate, random_start, split_start, static_labels
+from .global_frame import GlobalFrame, global_frame
+from .pca import principal_components
+from .settings import EncoderSettings
+
+# Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
+ROUNDING = 1e-12
+# Signals of at most so many values times clusters get this many random starts beside the splits.
+SMALL, SMALL_STARTS = 1 << 20, 3
+CHUNK = 4096
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """x_p = bases[c, 0] + sum over i of weights[p, i - 1] bases[c, i], with c = cluster[p] (Sloan et al. 2003, 3.3).
+
+    cluster: (p,) int32; bases: (clusters, vectors + 1, n) float32, vector 0 the mean; weights: (p, vectors) float32.
+    A cluster of fewer vectors has zeros in the rest of its bases and its points' weights.
+    vectors_per_cluster: (clusters,) int32. squared_error: over all points and values, in the metric.
+    relative_error: the same over the signal's own sum of squares in the metric.
+    discarded: (clusters,) float64, each cluster's share of squared_error, the sum of its discarded D_i^2.
+    history: (seconds, stage, squared error).
+    """
+
+    cluster: NDArray[np.int32]
+    bases: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    vectors_per_cluster: NDArray[np.int32]
+    squared_error: float
+    relative_error: float
+    discarded: NDArray[np.float64]
+    history: tuple[tuple[float, str, float], ...]
+
+    @property
+    def storage_cost(self) -> int:
+        """Numbers stored, m_p n' + m_c (n' + 1) n, counting for every cluster the vectors that it has (section 4.1)."""
+        points = np.bincount(self.cluster, minlength=len(self.bases))
+        per_point = int((points * self.vectors_per_cluster).sum())
+        return per_point + int((self.vectors_per_cluster + 1).sum()) * self.bases.shape[2]
+
+    def decode(self, points: slice = slice(None)) -> NDArray[np.float32]:
+        """The approximated signal of a range of points: (points, n) float32."""
+        cluster, weights = self.cluster[points], self.weights[points]
+        result = np.empty((len(cluster), self.bases.shape[2]), np.float32)
+        for index in np.unique(cluster):
+            members = np.flatnonzero(cluster == index)
+            result[members] = self.bases[index, 0] + multiply(weights[members], self.bases[index, 1:])
+        return result
+
+
+def encode(signal: NDArray[np.floating], settings: EncoderSettings, metric: NDArray | None = None,
+           progress: Progress | None = None) -> Encoding:
+    """Clustered PCA of a signal (p, n), one row per surface point (Sloan et al. 2003, section 4).
+
+    metric: (m, m) symmetric positive, m a divisor of n, acting on the rows of a point's values seen as (m, n / m): the
+    error is measured and minimised in it (for glossy rows the hemisphere's Gram matrix A). None is the identity.
+    progress: called with the fraction done; what it raises (Cancelled) ends the encode.
+    Raises PRTError for an empty signal, NaN or infinity, or an impossible metric. Clusters without points are left out,
+    and fewer clusters and vectors are used where more would not lower the error.
+    """
+    started = time.perf_counter()
+    history: list[tuple[float, str, float]] = []
+    frame = global_frame(signal, metric)
+    unit = frame.scale**2
+
+    def report(stage: str, error: float, fraction: float) -> None:
+        history.append((time.perf_counter() - started, stage, error * unit))
+        if progress is not None:
+            progress(min(max(fraction, 0.0), 1.0))
+
+    labels, vectors = _classify(frame, settings, report)
+    result = _finish(frame, labels, vectors, _enough(frame, settings) if settings.target_error is not None else None)
+    report("done", float(result.discarded.sum()) / unit, 1.0)
+    return Encoding(result.cluster, result.bases, result.weights, result.vectors_per_cluster, result.squared_error,
+                    result.relative_error, result.discarded, tuple(history))
+
+
+def pca(signal: NDArray[np.floating], vectors: int, metric: NDArray | None = None) -> Encoding:
+    """One principal component analysis of the whole signal: one cluster."""
+    return encode(signal, EncoderSettings(clusters=1, vectors=vectors, method="static"), metric)
+
+
+def vector_quantization(signal: NDArray[np.floating], clusters: int, seed: int = 0,
+                        iterations: int = 100) -> Encoding:
+    """LBG alone: many clusters of a mean each."""
+    return encode(signal, EncoderSettings(clusters, 0, "static", seed, iterations))
+
+
+def _enough(frame: GlobalFrame, settings: EncoderSettings) -> float:
+    """The squared error, in the frame's units, below which nothing more is spent."""
+    return max(settings.target_error or 0.0, ROUNDING) * frame.energy
+
+
+def _classify(frame: GlobalFrame, settings: EncoderSettings,
+              report: Callable[[str, float, float], None]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Every point's cluster and every cluster's number of vectors, by the method asked for."""
+    if settings.clusters == 1 or frame.tail[0] <= ROUNDING * frame.energy:
+        return np.zeros(len(frame.coordinates), np.int32), np.array([settings.vectors])
+    if settings.method == "static":
+        labels = static_labels(frame, settings)
+        return labels, np.full(int(labels.max()) + 1, settings.vectors)
+    enough = _enough(frame, settings)
+    share = 0.6 if settings.method == "adaptive" else 1.0
+    state = split_start(frame, settings, enough)
+    states = [state]
+    if settings.target_error is None:
+        states += [random_start(frame, settings, number) for number in range(_restarts(frame, settings))]
+    errors = []
+    for number, state in enumerate(states):
+        def report_part(stage: str, error: float, fraction: float, number: int = number) -> None:
+            report(stage, error, (number + fraction) / len(states) * share)
+        errors.append(iterate(frame, state, settings, enough, report_part))
+    state = states[int(np.argmin(errors))]
+    if settings.method == "adaptive":
+        adapt(frame, state, settings, lambda stage, error, part: report(stage, error, share + (1 - share) * part))
+    return state.labels, state.vectors
+
+
+def _restarts(frame: GlobalFrame, settings: EncoderSettings) -> int:
+    """How many of the paper's random starts are tried beside the splits: some where the signal is small."""
+    if settings.restarts is not None:
+        return settings.restarts
+    return SMALL_STARTS if frame.coordinates.size * settings.clusters <= SMALL else 0
+
+
+def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64], enough: float | None) -> Encoding:
+    """Exact PCA of every cluster on all values, then back to the signal's own values.
+
+    enough: squared error up to which the least useful vectors are left out again; None keeps all.
+    """
+    used, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    members = np.split(np.argsort(labels, kind="stable"), np.cumsum(counts)[:-1])
+    fits = [principal_components(frame.coordinates[points], int(vectors[cluster]))
+            for cluster, points in zip(used, members, strict=True)]
+    scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
+    kept = np.array([len(fit[2]) for fit in fits])
+    if enough is not None:
+        kept = trim_vectors([fit[2] for fit in fits], counts, scatter, enough)
+    most, values = int(kept.max()), frame.coordinates.shape[1]
+    bases = np.zeros((len(fits), most + 1, values))
+    weights = np.zeros((len(labels), most), np.float32)
+    discarded = np.zeros(len(fits))
+    for cluster, (points, (mean, axes, _)) in enumerate(zip(members, fits, strict=True)):
+        axes = axes[:kept[cluster]]
+        bases[cluster, 0], bases[cluster, 1:len(axes) + 1] = mean, axes
+        for start in range(0, len(points), CHUNK):
+            rows = points[start:start + CHUNK]
+            centred = frame.coordinates[rows] - mean
+            weights[rows, :len(axes)] = multiply(centred, axes.T)
+            discarded[cluster] += np.square(centred - multiply(weights[rows, :len(axes)].astype(float), axes)).sum()
+    original = multiply(bases.reshape(-1, values), frame.backward).reshape(bases.shape)
+    original[:, 0] += frame.mean
+    discarded *= frame.scale**2
+    total = float(discarded.sum())
+    energy = frame.energy * frame.scale**2
+    return Encoding(labels.astype(np.int32), original.astype(np.float32), weights, kept.astype(np.int32), total,
+                    total / energy if energy > 0 else 0.0, discarded, ())
+
+
+def _scatter_about(frame: GlobalFrame, points: NDArray[np.intp], mean: NDArray[np.float64]) -> float:
+    """Summed squared distance of points to a mean."""
+    return sum(float(np.square(frame.coordinates[points[start:start + CHUNK]] - mean).sum())
+               for start in range(0, len(points), CHUNK))

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""First clusters by best-first two-way splits, each judged by the error with the clusters' own few vectors.
+
+LBG's random seeds ignore that a cluster with vectors may be long and thin; splitting the cluster whose split lowers
+the error most puts clusters where the signal bends.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .subspaces import SPARE, Fit, Single, fit_subspace, squared_distances
+
+# Alternations of fitting both halves and reassigning their points.
+ROUNDS = 4
+
+
+@dataclass(order=True)
+class _Leaf:
+    """A cluster in the queue. key: minus its error until its split is known, then minus what the split gains."""
+
+    key: float
+    number: int
+    members: NDArray[np.intp] = field(compare=False)
+    basis: Single = field(compare=False)
+    error: float = field(compare=False)
+    halves: tuple[_Leaf, _Leaf] | None = field(compare=False, default=None)
+
+
+def split_points(points: Single, basis: Single, vectors: int) -> tuple[NDArray[np.bool_], Fit, Fit] | None:
+    """Divide points (m, d) between two subspaces of few vectors; None where they cannot be divided.
+
+    basis: (q, d) start of both subspaces' vectors. The first division is by the sign of the first weight.
+    """
+    weights = fit_subspace(points, basis).weights
+    side = weights[:, 0] > 0
+    for _ in range(ROUNDS):
+        if not 0 < side.sum() < len(side):
+            return None
+        fits = fit_subspace(points[~side], basis), fit_subspace(points[side], basis)
+        now = squared_distances(points, fits[1], vectors) < squared_distances(points, fits[0], vectors)
+        if np.array_equal(now, side):
+            break
+        side = now
+    if not 0 < side.sum() < len(side):
+        return None
+    return side, fit_subspace(points[~side], fits[0].basis), fit_subspace(points[side], fits[1].basis)
+
+
+def fit_error(fit: Fit, vectors: int) -> float:
+    """Squared error of a fit that uses its leading vectors."""
+    return max(float(fit.squares.sum(dtype=np.float64) - fit.spread[:vectors].sum()), 0.0)
+
+
+def split_seeds(data: Single, clusters: int, vectors: int, enough: float) -> NDArray[np.int32]:
+    """Labels (p,) of at most `clusters` clusters of data (p, d); stops early at a squared error of `enough`."""
+    block = vectors + SPARE
+    start = fit_subspace(data, np.zeros((block, data.shape[1]), np.float32))
+    fit = fit_subspace(data, start.basis)
+    error = fit_error(fit, vectors)
+    queue = [_Leaf(-error, 0, np.arange(len(data)), fit.basis, error)]
+    done: list[_Leaf] = []
+    made = 1
+    while queue and len(queue) + len(done) < clusters and error > enough:
+        leaf = heapq.heappop(queue)
+        if leaf.halves is None:
+            _judge(data, leaf, vectors, made)
+            if leaf.halves is None or leaf.key >= 0:
+                done.append(leaf)
+            else:
+                heapq.heappush(queue, leaf)
+            continue
+        error += leaf.key
+        made += 2
+        for number, half in enumerate(leaf.halves):
+            half.number = made + number
+            heapq.heappush(queue, half)
+    labels = np.zeros(len(data), np.int32)
+    for label, leaf in enumerate(sorted(queue + done, key=lambda leaf: leaf.members[0])):
+        labels[leaf.members] = label
+    return labels
+
+
+def _judge(data: Single, leaf: _Leaf, vectors: int, number: int) -> None:
+    """Try to split a leaf: fills its halves and its key, or leaves halves None."""
+    split = split_points(data[leaf.members], leaf.basis, vectors)
+    if split is None:
+        return
+    side, left, right = split
+    errors = fit_error(left, vectors), fit_error(right, vectors)
+    leaf.halves = (_Leaf(-errors[0], number, leaf.members[~side], left.basis, errors[0]),
+                   _Leaf(-errors[1], number, leaf.members[side], right.basis, errors[1]))
+    leaf.key = sum(errors) - leaf.error

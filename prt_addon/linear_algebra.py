@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Dense products, factorizations and eigenproblems through scipy's BLAS and LAPACK.
+
+Official Blender builds carry a numpy without an optimised BLAS, up to 700 times slower at these products than the
+numpy of the test machine, so every large product of the core goes through here (a test holds that).
+
+BLAS is column-major: a C-ordered matrix is the transpose of a Fortran-ordered one, and (a b) = ((b^T) (a^T))^T, so the
+transposed views below enter and leave BLAS without a copy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.linalg import blas, lapack
+from scipy.sparse import csr_array
+
+Array = NDArray[np.floating]
+
+
+def _same_type(*arrays: Array) -> np.dtype:
+    """float32 when every array is float32, else float64: no product silently loses precision."""
+    return np.dtype(np.float32) if all(a.dtype == np.float32 for a in arrays) else np.dtype(np.float64)
+
+
+def _operand(matrix: Array) -> tuple[Array, int]:
+    """The Fortran-ordered array and the transpose flag that stand for `matrix` as BLAS's transposed operand."""
+    if matrix.flags.c_contiguous:
+        return matrix.T, 0
+    if matrix.flags.f_contiguous:
+        return matrix, 1
+    return np.ascontiguousarray(matrix).T, 0
+
+
+def multiply(a: Array, b: Array, out: Array | None = None, accumulate: bool = False) -> Array:
+    """The product a (m, k) times b (k, n) as a C-ordered (m, n) array.
+
+    out: a C-ordered (m, n) array of the product's type to write into; accumulate adds to it instead of replacing it.
+    """
+    kind = _same_type(a, b)
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[0]:
+        raise ValueError(f"multiply: shapes {a.shape} and {b.shape} do not fit")
+    if 0 in (*a.shape, *b.shape):
+        result = np.zeros((a.shape[0], b.shape[1]), kind) if out is None else out
+        if out is not None and not accumulate:
+            out[...] = 0
+        return result
+    right, right_flag = _operand(np.asarray(b, kind))
+    left, left_flag = _operand(np.asarray(a, kind))
+    gemm = blas.sgemm if kind == np.float32 else blas.dgemm
+    if out is None:
+        return gemm(1.0, right, left, trans_a=right_flag, trans_b=left_flag).T
+    if out.dtype != kind or not out.flags.c_contiguous or out.shape != (a.shape[0], b.shape[1]):
+        raise ValueError("multiply: out must be a C-ordered array of the product's shape and type")
+    gemm(1.0, right, left, beta=1.0 if accumulate else 0.0, c=out.T, overwrite_c=True,
+         trans_a=right_flag, trans_b=left_flag)
+    return out
+
+
+def gram(a: Array) -> Array:
+    """a^T a for a (m, n): (n, n), symmetric to the last bit."""
+    kind = _same_type(a)
+    if 0 in a.shape:
+        return np.zeros((a.shape[1], a.shape[1]), kind)
+    syrk = blas.ssyrk if kind == np.float32 else blas.dsyrk
+    operand, flag = _operand(np.asarray(a, kind))
+    lower = syrk(1.0, operand, trans=flag, lower=1)
+    return np.tril(lower) + np.tril(lower, -1).T
+
+
+def batched_multiply(a: Array, b: Array) -> Array:
+    """The products a (k, m, n) times b (k, n, p), stacked: (k, m, p)."""
+    result = np.empty((a.shape[0], a.shape[1], b.shape[2]), _same_type(a, b))
+    for index in range(a.shape[0]):
+        multiply(a[index], b[index], out=result[index])
+    return result
+
+
+def symmetric_eigenpairs(matrix: Array, count: int | None = None) -> tuple[Array, Array]:
+    """Eigenvalues in descending order (count,) and eigenvectors as columns (n, count) of a symmetric matrix.
+
+    Signs are fixed (largest component of each vector positive), so results do not depend on the LAPACK in use.
+    """
+    size = matrix.shape[0]
+    count = size if count is None else min(count, size)
+    if count == 0:
+        return np.zeros(0, matrix.dtype), np.zeros((size, 0), matrix.dtype)
+    values, vectors = linalg.eigh(matrix, subset_by_index=(size - count, size - 1), check_finite=True)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    signs = np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(count)])
+    return np.ascontiguousarray(values), np.ascontiguousarray(vectors * np.where(signs == 0, 1, signs))
+
+
+def small_symmetric_eigenpairs(matrix: Array) -> tuple[Array, Array]:
+    """All eigenvalues, descending, and eigenvectors as columns of a small symmetric matrix, in double precision.
+
+    LAPACK's driver without scipy's checks, which cost ten times the solution at sizes below about 20. Signs as LAPACK
+    leaves them. Raises ValueError where LAPACK does not converge (NaN or infinity in the matrix).
+    """
+    values, vectors, status = lapack.dsyevd(matrix)
+    if status != 0:
+        raise ValueError(f"small_symmetric_eigenpairs: LAPACK's dsyevd ended with {status}")
+    return values[::-1], vectors[:, ::-1]
+
+
+def row_squares(a: Array) -> Array:
+    """The squared length of every row of a (m, n): (m,), in a's own precision."""
+    return np.einsum("ij,ij->i", a, a)
+
+
+def sparse_multiply(a: csr_array, b: Array) -> Array:
+    """The product of a sparse a (m, k) and a dense b (k, n): (m, n).
+
+    scipy's own compiled loop, no BLAS involved: every row of the result depends on its row of `a` alone, to the last
+    bit.
+    """
+    return a @ b

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One object's triangles as a reader delivers them, and what is dropped from them before anything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import BadScene
+
+
+@dataclass(frozen=True)
+class ObjectMesh:
+    """One object's evaluated triangles in world space, as the reader delivers them.
+
+    positions: (v, 3) float64, metres. triangles: (t, 3) int32 into positions, counter-clockwise seen from outside.
+    corner_normals, corner_albedo: (t, 3, 3) float32; unit shading normals, linear Rec.709 reflectance in [0, 1].
+    is_target: transfer is stored for it (every object casts shadows and bounces light).
+    matrix: (4, 4) float64, object to world. winding_flipped: the reader turned the triangles of a mirrored object.
+    """
+
+    name: str
+    positions: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    corner_normals: NDArray[np.float32]
+    corner_albedo: NDArray[np.float32]
+    is_target: bool
+    matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    winding_flipped: bool = False
+
+
+def bounding_diagonal(point_sets: list[NDArray[np.float64]]) -> float:
+    """Diagonal of the box around all points; 0.0 without points."""
+    filled = [p for p in point_sets if len(p)]
+    if not filled:
+        return 0.0
+    low = np.min([p.min(axis=0) for p in filled], axis=0)
+    high = np.max([p.max(axis=0) for p in filled], axis=0)
+    return float(np.sqrt(np.sum((high - low) ** 2)))
+
+
+def clean(mesh: ObjectMesh, warnings: list[str]) -> ObjectMesh:
+    """Without zero-area and duplicate triangles. Raises BadScene where a target has nothing left or is not finite."""
+    bad = ~np.isfinite(mesh.positions).all(axis=1)
+    if bad.any():
+        raise BadScene(mesh.name, f"{int(bad.sum())} vertices have no finite coordinates",
+                       "Delete them, or mend the modifier that makes them")
+    if not len(mesh.triangles):
+        if mesh.is_target:
+            raise BadScene(mesh.name, "the mesh has no faces", "Add faces, or bake another object")
+        return mesh
+    corners = mesh.positions[mesh.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    longest = max(float(np.abs(corners - corners[:, :1]).max()), float(np.finfo(np.float64).tiny))
+    # Relative to the object, so that a scene of 1e-6 metres keeps its triangles: area below 1e-14 of the largest
+    # extent squared can't be told from rounding in the single precision that Embree traces in.
+    area_kept = np.sqrt(np.sum((normal / longest) ** 2, axis=1)) > 1e-14 * longest
+    key = np.sort(mesh.triangles, axis=1)
+    first = np.zeros(len(key), bool)
+    first[np.unique(key, axis=0, return_index=True)[1]] = True
+    kept = area_kept & first
+    if not kept.all():
+        count, twins = int((~area_kept).sum()), int((area_kept & ~first).sum())
+        warnings.append(f"{mesh.name}: dropped {count} zero-area and {twins} duplicate triangles")
+    if not kept.any():
+        if mesh.is_target:
+            raise BadScene(mesh.name, "all faces have zero area", "Give the faces an area, or bake another object")
+        warnings.append(f"{mesh.name}: casts nothing, all faces have zero area")
+    return replace(mesh, triangles=mesh.triangles[kept], corner_normals=mesh.corner_normals[kept],
+                   corner_albedo=mesh.corner_albedo[kept])

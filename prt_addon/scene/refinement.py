@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Refinement of triangles too coarse to carry transfer at their points (a floor of two triangles under a statue)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# A triangle is cut into at most 4^12 parts: beyond that the spacing is wrong, not the mesh.
+MAXIMUM_ROUNDS = 12
+
+
+def refine(points: NDArray[np.float64], normals: NDArray[np.float64], albedo: NDArray[np.float64],
+           triangles: NDArray[np.int32], longest_edge: float,
+           ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
+    """Split edges longer than longest_edge (metres) at their middle until none is left.
+
+    An edge is split for both its triangles or for neither, so no T-junction appears between triangles that share
+    points. New points stay on the flat triangle (shadows fall on what is drawn); normals and albedo are interpolated.
+    """
+    for _ in range(MAXIMUM_ROUNDS):
+        edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).astype(np.int64)
+        low, high = edges.min(axis=2), edges.max(axis=2)
+        too_long = np.sqrt(np.sum((points[low] - points[high]) ** 2, axis=2)) > longest_edge
+        if not too_long.any():
+            break
+        key = low * len(points) + high
+        split_keys, middle_of = np.unique(key[too_long], return_inverse=True)
+        middle = np.full(triangles.shape, -1, np.int64)
+        middle[too_long] = len(points) + middle_of
+        ends = np.stack([split_keys // len(points), split_keys % len(points)], axis=1)
+        points = np.concatenate([points, points[ends].mean(axis=1)])
+        between = normals[ends].sum(axis=1)
+        length = np.sqrt(np.sum(between ** 2, axis=1, keepdims=True))
+        between = np.where(length > 1e-6, between / np.maximum(length, 1e-6), normals[ends[:, 0]])
+        normals = np.concatenate([normals, between])
+        albedo = np.concatenate([albedo, albedo[ends].mean(axis=1)])
+        triangles = _cut(points, triangles, middle)
+    return points, normals, albedo, triangles
+
+
+def _cut(points: NDArray[np.float64], triangles: NDArray[np.int32], middle: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Triangles cut at the middles (t, 3) of their edges (corner k to k + 1); -1 leaves an edge whole."""
+    split = middle >= 0
+    count = split.sum(axis=1)
+    parts = [triangles[count == 0]]
+    # Three middles: four similar triangles.
+    (a, b, c), (ab, bc, ca) = triangles[count == 3].T, middle[count == 3].T
+    parts += [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    # One middle: turn the triangle so that it lies on the first edge.
+    a, b, c, ab, _ = _turned(triangles[count == 1], middle[count == 1], split[count == 1].argmax(axis=1))
+    parts += [np.stack(t, axis=1) for t in ((a, ab, c), (ab, b, c))]
+    # Two middles: turn so that the whole edge is the last, then cut the quad along its shorter diagonal.
+    a, b, c, ab, bc = _turned(triangles[count == 2], middle[count == 2], ((~split[count == 2]).argmax(axis=1) + 1) % 3)
+    short = np.sum((points[a] - points[bc]) ** 2, axis=1) < np.sum((points[ab] - points[c]) ** 2, axis=1)
+    parts += [np.stack((ab, b, bc), axis=1),
+              np.stack((a, ab, bc), axis=1)[short], np.stack((a, bc, c), axis=1)[short],
+              np.stack((a, ab, c), axis=1)[~short], np.stack((ab, bc, c), axis=1)[~short]]
+    return np.concatenate(parts).astype(np.int32)
+
+
+def _turned(triangles: NDArray[np.int32], middle: NDArray[np.int64], start: NDArray[np.int64],
+            ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """Corners and the middles of the first two edges, counted from corner `start` of each triangle."""
+    order = (start[:, None] + np.arange(3)) % 3
+    corners = np.take_along_axis(triangles, order, axis=1)
+    middles = np.take_along_axis(middle, order, axis=1)
+    return corners[:, 0], corners[:, 1], corners[:, 2], middles[:, 0], middles[:, 1]

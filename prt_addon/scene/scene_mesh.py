@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The traced scene: one triangle soup whose points are the receivers.
+
+A vertex where normals or albedo differ between its faces becomes one point per group of equal face corners, so that a
+cube gets right edges and two materials meet in a sharp line. Triangles too coarse for per-point transfer are refined.
+Nothing in later stages has to know about vertices, corners or objects again: M_p belongs to a point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import BadScene
+from .object_mesh import ObjectMesh, bounding_diagonal, clean
+from .orientation import outward
+from .refinement import refine
+
+# Corners of one vertex whose normals differ by less than 0.25 degrees, or albedos by less than half an 8-bit step, are
+# one receiver: below what interpolation shows, above the noise of Blender's packed custom normals.
+NORMAL_TOLERANCE = 0.0044
+ALBEDO_TOLERANCE = 0.5 / 255.0
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """An object's share of the scene: its points and triangles are contiguous.
+
+    matches_source: the points are, one to one and in order, the vertices of the evaluated mesh.
+    source_points: how many vertices the evaluated mesh has.
+    """
+
+    name: str
+    is_target: bool
+    points: slice
+    triangles: slice
+    matches_source: bool
+    source_points: int
+    matrix: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SceneMesh:
+    """Every triangle that casts shadows or bounces light, and the receivers on it.
+
+    points, normals: (p, 3) float64 world space; triangles: (t, 3) int32 into points; albedo: (p, 3) float32;
+    loose: (p,) bool, points without a face (they keep their place, so that data fits the mesh, and get no transfer);
+    warnings: what was dropped or repaired, one line each.
+    """
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    albedo: NDArray[np.float32]
+    loose: NDArray[np.bool_]
+    objects: tuple[SceneObject, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the bounding box of the target objects, in metres."""
+        return bounding_diagonal([self.points[o.points] for o in self.objects if o.is_target])
+
+    @staticmethod
+    def assemble(objects: list[ObjectMesh], spacing: float = 0.0) -> SceneMesh:
+        """Join objects into one scene.
+
+        spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal; 0 keeps the
+        meshes as they are. Raises BadScene, naming the object, where nothing can be baked.
+        """
+        if not any(o.is_target for o in objects):
+            raise BadScene("scene", "no mesh object to bake", "Select a mesh object, or make one visible in renders")
+        warnings: list[str] = []
+        cleaned = [clean(o, warnings) for o in objects]
+        cleaned = [outward(o, [c for c in cleaned if c is not o], warnings) for o in cleaned]
+        diagonal = bounding_diagonal([o.positions for o in cleaned if o.is_target])
+        if diagonal <= 0.0:
+            name = next(o.name for o in cleaned if o.is_target)
+            raise BadScene(name, "all vertices lie in one point", "Give the object a size")
+        parts = [_split(o, spacing * diagonal, warnings) for o in cleaned]
+        return _join(cleaned, parts, tuple(warnings))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """An object after splitting and refining, with its own numbering."""
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    albedo: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    matches_source: bool
+
+
+def _corner_groups(mesh: ObjectMesh) -> tuple[NDArray[np.int64], int]:
+    """The group of each corner (t * 3,) such that corners of one group share vertex, normal and albedo.
+
+    Corners of a vertex are compared with the vertex's first ungrouped corner, round after round: one round for a
+    smooth mesh, as many as the vertex has groups otherwise. Group g < v is the first group of vertex g.
+    """
+    vertex = mesh.triangles.ravel().astype(np.int64)
+    normal = mesh.corner_normals.reshape(-1, 3)
+    albedo = mesh.corner_albedo.reshape(-1, 3)
+    group = np.full(len(vertex), -1, np.int64)
+    count = len(mesh.positions)
+    pending = np.arange(len(vertex))
+    first_round = True
+    while len(pending):
+        owners, leader_place = np.unique(vertex[pending], return_index=True)
+        leader = np.zeros(len(mesh.positions), np.int64)
+        leader[owners] = pending[leader_place]
+        lead = leader[vertex[pending]]
+        same = (np.abs(normal[pending] - normal[lead]).max(axis=1) <= NORMAL_TOLERANCE) & (
+            np.abs(albedo[pending] - albedo[lead]).max(axis=1) <= ALBEDO_TOLERANCE)
+        same |= pending == lead  # a corner without a finite normal still leads its own group
+        number = np.zeros(len(mesh.positions), np.int64)
+        if first_round:
+            number[owners] = owners
+        else:
+            number[owners] = count + np.arange(len(owners))
+            count += len(owners)
+        group[pending[same]] = number[vertex[pending[same]]]
+        pending = pending[~same]
+        first_round = False
+    return group, count
+
+
+def _split(mesh: ObjectMesh, longest_edge: float, warnings: list[str]) -> _Part:
+    """Corner groups become points; triangles with an edge over longest_edge (metres; 0 = none) are refined."""
+    group, count = _corner_groups(mesh)
+    points = np.empty((count, 3))
+    points[:len(mesh.positions)] = mesh.positions
+    points[group] = mesh.positions[mesh.triangles.ravel()]
+    normals = _mean_per_group(mesh.corner_normals.reshape(-1, 3), group, count)
+    length = np.sqrt(np.sum(normals ** 2, axis=1))
+    triangles = group.reshape(-1, 3).astype(np.int32)
+    degenerate = length < 1e-6
+    normals[~degenerate] /= length[~degenerate, None]
+    _replace_normals(points, triangles, normals, degenerate)
+    albedo = np.clip(_mean_per_group(mesh.corner_albedo.reshape(-1, 3), group, count), 0.0, 1.0)
+    matches = count == len(mesh.positions)
+    if longest_edge > 0.0:
+        before = len(points)
+        points, normals, albedo, triangles = refine(points, normals, albedo, triangles, longest_edge)
+        if len(points) != before:
+            matches = False
+            warnings.append(f"{mesh.name}: refined from {before} to {len(points)} receivers")
+    return _Part(points, normals, albedo.astype(np.float32), triangles, matches)
+
+
+def _mean_per_group(values: NDArray[np.floating], group: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+    """Mean of values (corners, 3) per group (count, 3) float64; zero for a group without corners."""
+    members = np.bincount(group, minlength=count)
+    sums = np.stack([np.bincount(group, weights=values[:, axis], minlength=count) for axis in range(3)], axis=1)
+    return sums / np.maximum(members, 1)[:, None]
+
+
+def _replace_normals(points: NDArray[np.float64], triangles: NDArray[np.int32], normals: NDArray[np.float64],
+                     which: NDArray[np.bool_]) -> None:
+    """Give points without a usable shading normal the area-weighted normal of their faces; loose ones get up."""
+    if not which.any():
+        return
+    corners = points[triangles]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = _mean_per_group(np.repeat(face, 3, axis=0), triangles.ravel().astype(np.int64), len(points))
+    length = np.sqrt(np.sum(total ** 2, axis=1))
+    usable = length > 0.0
+    normals[which] = (0.0, 0.0, 1.0)
+    both = which & usable
+    normals[both] = total[both] / length[both, None]
+
+
+def _join(objects: list[ObjectMesh], parts: list[_Part], warnings: tuple[str, ...]) -> SceneMesh:
+    """Concatenate the parts and number their points and triangles through."""
+    scene_objects, first_point, first_triangle, triangles = [], 0, 0, []
+    for mesh, part in zip(objects, parts, strict=True):
+        end_point, end_triangle = first_point + len(part.points), first_triangle + len(part.triangles)
+        scene_objects.append(SceneObject(mesh.name, mesh.is_target, slice(first_point, end_point),
+                                         slice(first_triangle, end_triangle), part.matches_source,
+                                         len(mesh.positions), np.asarray(mesh.matrix, np.float64)))
+        triangles.append(part.triangles + first_point)
+        first_point, first_triangle = end_point, end_triangle
+    if first_point >= 2 ** 31:
+        raise BadScene("scene", f"{first_point} receivers do not fit 32-bit indices", "Bake fewer objects at once")
+    joined = np.concatenate(triangles).astype(np.int32)
+    loose = np.ones(first_point, bool)
+    loose[joined.ravel()] = False
+    return SceneMesh(np.concatenate([p.points for p in parts]), np.concatenate([p.normals for p in parts]), joined,
+                     np.concatenate([p.albedo for p in parts]), loose, tuple(scene_objects), warnings)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked transfer of one object, and how it is laid out in attributes, properties and files (design/contract.md)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import StorageError
+
+SCHEMA = 1
+CLUSTER_ATTRIBUTE = "prt_cluster"
+WEIGHTS_ATTRIBUTE = "prt_weights_"
+ALBEDO_ATTRIBUTE = "prt_albedo"
+HEADER_PROPERTY = "prt_header"
+BASES_PROPERTY = "prt_bases"
+REBAKE = "Bake the object again"
+
+
+@dataclass(frozen=True)
+class BakedTransfer:
+    """Compressed transfer M_p of one object's receivers: M_p = bases[c, 0] + sum_k weights[p, k] bases[c, k + 1].
+
+    header: JSON-able dict (see `make_header`); cluster: (p,) int32; weights: (p, vectors) float32;
+    bases: (clusters, vectors + 1, rows, columns, channels) float32, vector 0 the cluster mean;
+    albedo: (p, 3) float32; positions, normals: (p, 3) float32 world space when baked; triangles: (t, 3) int32.
+    """
+
+    header: dict[str, Any]
+    cluster: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    bases: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+    @property
+    def columns(self) -> int:
+        """Number of lighting basis functions."""
+        return self.bases.shape[3]
+
+
+def make_header(shape: tuple[int, ...], columns: dict[str, Any], rows: dict[str, Any], **extra: Any) -> dict[str, Any]:
+    """The header of a container: schema, shapes, conventions, lighting and exit basis, and what the caller adds.
+
+    shape: of the bases (clusters, vectors + 1, rows, columns, channels).
+    """
+    return {
+        "schema": SCHEMA,
+        "shape": [int(s) for s in shape],
+        "columns": columns,
+        "rows": rows,
+        "conventions": {
+            "axes": "Blender world: right-handed, Z up, metres",
+            "spherical_harmonics": "real, orthonormal, index l(l+1)+m, no Condon-Shortley phase",
+            "radiance": "W m^-2 sr^-1, linear Rec.709; diffuse rows are for unit albedo",
+        },
+        **extra,
+    }
+
+
+def check_header(header: Any, subject: str) -> dict[str, Any]:
+    """The header if this version can read it. Raises StorageError naming the subject otherwise."""
+    if not isinstance(header, dict) or not isinstance(header.get("schema"), int):
+        raise StorageError(subject, "its baked data has no readable header", REBAKE)
+    if header["schema"] > SCHEMA:
+        raise StorageError(subject, f"its baked data has schema {header['schema']}, this version reads up to {SCHEMA}",
+                           "Update the extension, or bake the object again")
+    shape = header.get("shape")
+    if not (isinstance(shape, list) and len(shape) == 5 and all(isinstance(s, int) and s > 0 for s in shape)):
+        raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
+    return header
+
+
+def parse_header(text: str, subject: str) -> dict[str, Any]:
+    """The header in a JSON text. Raises StorageError where it is broken or newer than this version."""
+    try:
+        header = json.loads(text)
+    except (ValueError, TypeError) as error:
+        raise StorageError(subject, f"the header of its baked data is not readable ({error})", REBAKE) from error
+    return check_header(header, subject)
+
+
+def pack_weights(weights: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Weights (p, vectors) as FLOAT4 arrays (p, 4): weight k is component k % 4 of array k // 4, the rest zero."""
+    points, vectors = weights.shape
+    count = -(-vectors // 4)
+    padded = np.zeros((points, 4 * count), np.float32)
+    padded[:, :vectors] = weights
+    return [np.ascontiguousarray(padded[:, 4 * k:4 * k + 4]) for k in range(count)]
+
+
+def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArray], flat_bases: NDArray,
+           geometry: tuple[NDArray, NDArray, NDArray, NDArray], subject: str) -> BakedTransfer:
+    """The container from stored arrays, checked against the header.
+
+    geometry: albedo, positions, normals (p, 3) and triangles (t, 3). Raises StorageError where a shape, an index or a
+    value can't be right, so that broken data is never drawn.
+    """
+    clusters, representatives, rows, columns, channels = check_header(header, subject)["shape"]
+    points, vectors = len(cluster), representatives - 1
+    albedo, positions, normals, triangles = geometry
+    expected = clusters * representatives * rows * columns * channels
+    if flat_bases.size != expected:
+        raise StorageError(subject, f"its bases hold {flat_bases.size} numbers instead of {expected}", REBAKE)
+    if len(packed_weights) != -(-vectors // 4) or any(w.shape != (points, 4) for w in packed_weights):
+        raise StorageError(subject, "its weights do not fit the header", REBAKE)
+    if len(positions) != points or len(albedo) != points or len(normals) != points:
+        raise StorageError(subject, f"the mesh has {len(positions)} points, the baked data {points}", REBAKE)
+    if points and not (0 <= int(cluster.min()) and int(cluster.max()) < clusters):
+        raise StorageError(subject, "a cluster index is out of range", REBAKE)
+    weights = np.concatenate([*packed_weights, np.zeros((points, 0), np.float32)], axis=1)[:, :vectors]
+    bases = np.asarray(flat_bases, np.float32).reshape(clusters, representatives, rows, columns, channels)
+    if not (np.isfinite(bases).all() and np.isfinite(weights).all()):
+        raise StorageError(subject, "its baked data holds values that are not finite", REBAKE)
+    return BakedTransfer(header, np.asarray(cluster, np.int32), np.asarray(weights, np.float32), bases,
+                         np.asarray(albedo, np.float32), np.asarray(positions, np.float32),
+                         np.asarray(normals, np.float32), np.asarray(triangles, np.int32))

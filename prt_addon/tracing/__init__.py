@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rays. The only folder that imports embreex; everything above asks the Tracer."""

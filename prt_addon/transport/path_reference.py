@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Independent reference: path tracing of unit-albedo exit radiance at a few receivers.
+
+Shares with the bake only the tracer and the places where rays start: directions are random and cosine-distributed,
+bounces are followed path by path, albedo and normal are interpolated where a path hits. Two independent halves let
+the error be estimated without bias by the reference's own noise: E[(x - a)(x - b)] = (x - truth)^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..basis.directions import tangent_frames
+from ..scene.receivers import LIFT
+from ..scene.scene_mesh import SceneMesh
+from ..tracing.tracer import Tracer
+from .receiver_set import ReceiverSet
+
+# After this many bounces a path goes on with the probability of its albedo (Russian roulette).
+SURE_BOUNCES = 4
+PATHS_AT_ONCE = 1 << 18
+# Rays leave a hit this far above it, as a multiple of LIFT: a hit's own position is known to a few units in the last
+# place, not exactly as a vertex's.
+HIT_LIFT = 4.0
+
+# What a path that leaves the scene in directions (n, 3) brings: (n, values, 3 or 1).
+Emission = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class DistantSuns:
+    """Directions to suns (s, 3) and their irradiance (s, 3) on a facing surface; they are sampled, not hit by chance."""
+
+    directions: NDArray[np.float64]
+    irradiance: NDArray[np.float64]
+
+
+@dataclass
+class _Paths:
+    """Paths in flight: owner among the receivers, place and normal of their last surface, throughput (n, 3)."""
+
+    owner: NDArray[np.int64]
+    origins: NDArray[np.float32]
+    normals: NDArray[np.float64]
+    throughput: NDArray[np.float64]
+
+    def subset(self, which: NDArray) -> _Paths:
+        return _Paths(self.owner[which], self.origins[which], self.normals[which], self.throughput[which])
+
+
+def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, albedo: NDArray[np.float32],
+                       emission: Emission, suns: DistantSuns, paths: int, bounces: int, seed: int,
+                       ) -> Generator[float, None, NDArray[np.float64]]:
+    """Yield progress, return (2, r, values, 3): unit-albedo exit radiance per emission value, from two halves.
+
+    albedo: (points, 3) that surfaces bounce with. emission may return several values per direction; sun light is added
+    to the last one. paths: per receiver, both halves together. bounces: most bounces, -1 for all (Russian roulette).
+    """
+    generator = np.random.Generator(np.random.PCG64(seed))
+    half = max(1, paths // 2)
+    result: list[NDArray[np.float64]] = []
+    at_once = max(1, PATHS_AT_ONCE // half)
+    for which in range(2):
+        parts = []
+        for start in range(0, len(receivers), at_once):
+            part = slice(start, min(start + at_once, len(receivers)))
+            parts.append(_half(tracer, scene, receivers, part, albedo, emission, suns, half, bounces, generator))
+            yield (which + part.stop / len(receivers)) / 2
+        result.append(np.concatenate(parts))
+    return np.stack(result)
+
+
+def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice, albedo: NDArray[np.float32],
+          emission: Emission, suns: DistantSuns, count: int, bounces: int, generator: np.random.Generator,
+          ) -> NDArray[np.float64]:
+    """Mean over `count` paths from each receiver of the part: (receivers, values, 3)."""
+    number = part.stop - part.start
+    values = emission(np.array([[0.0, 0.0, 1.0]])).shape[1]
+    total = np.zeros((number, values, 3))
+    paths = _Paths(np.repeat(np.arange(number), count), np.repeat(receivers.origins[part], count, axis=0),
+                   np.repeat(receivers.normals[part], count, axis=0), np.ones((number * count, 3)))
+    first = _stratified(number, count, generator)
+    depth = 0
+    while len(paths.owner):
+        _add_suns(tracer, paths, suns, total)
+        directions = _cosine_directions(paths.normals, first if depth == 0 else generator.random((len(paths.owner), 2)))
+        hits = tracer.nearest(paths.origins, directions)
+        tracer.rays += len(directions)
+        escaped = hits.triangle < 0
+        brought = emission(directions[escaped].astype(np.float64)) * paths.throughput[escaped, None, :]
+        np.add.at(total, paths.owner[escaped], brought)
+        if depth == bounces:
+            break
+        paths = _next(tracer, scene, paths, directions, hits, albedo)
+        paths = _roulette(paths, generator) if depth >= SURE_BOUNCES else paths
+        depth += 1
+    return total / count
+
+
+def _stratified(number: int, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    """A randomly shifted rank-1 lattice (golden ratio) per receiver: (number * count, 2) in [0, 1)."""
+    index = np.arange(count)
+    lattice = np.stack([(index + 0.5) / count, np.modf(index * ((np.sqrt(5.0) - 1.0) / 2.0))[0]], axis=1)
+    return ((lattice[None] + generator.random((number, 1, 2))) % 1.0).reshape(-1, 2)
+
+
+def _cosine_directions(normals: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Directions (n, 3) about the normals with density cos / pi, by Malley's method."""
+    radius, angle = np.sqrt(numbers[:, 0]), 2.0 * np.pi * numbers[:, 1]
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - numbers[:, 0])], axis=1)
+    return np.sum(local[:, :, None] * tangent_frames(normals), axis=1).astype(np.float32)
+
+
+def _add_suns(tracer: Tracer, paths: _Paths, suns: DistantSuns, total: NDArray[np.float64]) -> None:
+    """Add each sun's reflected light at the paths' surfaces to the last emission value."""
+    for direction, irradiance in zip(suns.directions, suns.irradiance, strict=True):
+        cosine = np.sum(paths.normals * direction, axis=1)
+        facing = np.flatnonzero(cosine > 0.0)
+        seen = facing[~tracer.occluded(paths.origins[facing], direction[None, :].astype(np.float32))]
+        tracer.rays += len(facing)
+        np.add.at(total[:, -1], paths.owner[seen],
+                  paths.throughput[seen] * (cosine[seen, None] / np.pi) * irradiance)
+
+
+def _next(tracer: Tracer, scene: SceneMesh, paths: _Paths, directions: NDArray[np.float32], hits,  # noqa: ANN001
+          albedo: NDArray[np.float32]) -> _Paths:
+    """The paths that hit something, reflected: at the hit, on the side that was hit, dimmed by its albedo."""
+    met = np.flatnonzero(hits.triangle >= 0)
+    corner = scene.triangles[hits.triangle[met]]
+    u, v = hits.u[met].astype(np.float64), hits.v[met].astype(np.float64)
+    weights = np.stack([1.0 - u - v, u, v], axis=1)[:, :, None]
+    places = scene.points[corner]
+    face = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
+    side = np.where(hits.front[met], 1.0, -1.0)[:, None]
+    normal = np.sum(weights * scene.normals[corner], axis=1)
+    normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), 1e-12)
+    origin = np.sum(weights * places, axis=1) + side * face * (HIT_LIFT * LIFT * tracer.diagonal)
+    dimmed = paths.throughput[met] * np.sum(weights * albedo[corner].astype(np.float64), axis=1)
+    return _Paths(paths.owner[met], tracer.to_tracing_space(origin), side * normal, dimmed)
+
+
+def _roulette(paths: _Paths, generator: np.random.Generator) -> _Paths:
+    """End paths at random in proportion to what they still carry; survivors carry more, so the mean is unchanged."""
+    chance = np.minimum(1.0, np.maximum(paths.throughput.max(axis=1), 1e-3))
+    survives = generator.random(len(chance)) < chance
+    paths = paths.subset(survives)
+    paths.throughput /= chance[survives, None]
+    return paths

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The encoders against closed forms, numpy's SVD, scikit-learn and the paper's procedure written out plainly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from prt_addon.compression import global_frame as frames
+from prt_addon.compression import reclassify as classification
+from prt_addon.compression.adaptive import adaptation_pays, distribute
+from prt_addon.compression.coherence import overdraw
+from prt_addon.compression.encoding import encode, pca, vector_quantization
+from prt_addon.compression.pca import principal_components
+from prt_addon.compression.reclassify import reclassify
+from prt_addon.compression.settings import EncoderSettings
+from prt_addon.compression.subspaces import from_labels, update
+from prt_addon.compression.vector_quantization import lbg
+from prt_addon.errors import BadArguments, Cancelled, PRTError
+from sklearn.cluster import KMeans
+from sklearn.decomposition import PCA
+
+METHODS = ("static", "iterative", "adaptive")
+
+
+def surface_signal(points: int = 2000, values: int = 16, seed: int = 0) -> NDArray[np.float32]:
+    """A transfer-like signal: smooth bumps over a curved two-dimensional surface, with kinks as shadows make."""
+    generator = np.random.default_rng(seed)
+    place = generator.uniform(-1, 1, (points, 2))
+    waves = generator.normal(0, 1.5, (2, values))
+    phases = generator.uniform(0, 2 * np.pi, values)
+    smooth = np.sin(place @ waves + phases)
+    return (smooth * np.where(place @ generator.normal(size=(2, values)) > 0.2, 1.0, 0.4)).astype(np.float32)
+
+
+def brute_squared_distances(signal: NDArray, means: list[NDArray], axes: list[NDArray]) -> NDArray:
+    """Squared approximation errors (p, K) of section 4.2, in double precision."""
+    result = []
+    for mean, rows in zip(means, axes, strict=True):
+        centred = signal.astype(float) - mean
+        result.append((centred**2).sum(axis=1) - ((centred @ rows.T) ** 2).sum(axis=1))
+    return np.stack(result, axis=1)
+
+
+def svd_fit(points: NDArray, vectors: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Mean, leading right singular vectors and all squared singular values."""
+    mean = points.astype(float).mean(axis=0)
+    _, singular, rows = np.linalg.svd(points.astype(float) - mean, full_matrices=False)
+    return mean, rows[:vectors], singular**2
+
+
+def papers_procedure(signal: NDArray, clusters: int, vectors: int, seed: int, sweeps: int = 15) -> float:
+    """Section 4.2 as published: random seeds, vectors one by one, some LBG iterations each; the squared error."""
+    generator = np.random.default_rng(seed)
+    means = list(signal[generator.choice(len(signal), clusters, replace=False)].astype(float))
+    axes = [np.zeros((0, signal.shape[1]))] * clusters
+    for count in range(vectors + 1):
+        for _ in range(sweeps):
+            labels = brute_squared_distances(signal, means, axes).argmin(axis=1)
+            for k in np.unique(labels):
+                means[k], axes[k], _ = svd_fit(signal[labels == k], count)
+    return float(sum(svd_fit(signal[labels == k], 0)[2][vectors:].sum() for k in np.unique(labels)))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_squared_error_is_the_sum_of_discarded_eigenvalues(method: str) -> None:
+    signal = surface_signal()
+    result = encode(signal, EncoderSettings(20, 3, method))
+    discarded = sum(svd_fit(signal[result.cluster == k], 0)[2][result.vectors_per_cluster[k]:].sum()
+                    for k in range(len(result.bases)))
+    actual = ((result.decode().astype(float) - signal) ** 2).sum()
+    assert result.squared_error == pytest.approx(discarded, rel=1e-5)
+    assert result.squared_error == pytest.approx(actual, rel=1e-4)
+    assert result.relative_error == pytest.approx(discarded / (signal.astype(float) ** 2).sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("points", [12, 500])
+def test_one_cluster_is_sklearns_pca(points: int) -> None:
+    """Both sides of the Gram matrix: fewer points than values, and more."""
+    signal = surface_signal(points, 30) + 3.0
+    ours = pca(signal, 5)
+    theirs = PCA(5, svd_solver="full").fit(signal.astype(float))
+    np.testing.assert_allclose(ours.bases[0, 0], theirs.mean_, atol=1e-5)
+    cosines = np.abs((ours.bases[0, 1:] * theirs.components_).sum(axis=1))
+    np.testing.assert_allclose(cosines, 1, atol=1e-5)
+    expected = theirs.inverse_transform(theirs.transform(signal.astype(float)))
+    np.testing.assert_allclose(ours.decode(), expected, atol=2e-5)
+
+
+def test_principal_components_orthonormal_and_equal_svd() -> None:
+    points = surface_signal(300, 20)
+    mean, vectors, squares = principal_components(points, 6)
+    expected_mean, expected, singular = svd_fit(points, 6)
+    np.testing.assert_allclose(mean, expected_mean, atol=1e-12)
+    np.testing.assert_allclose(squares, singular[:6], rtol=1e-9)
+    np.testing.assert_allclose(vectors @ vectors.T, np.eye(6), atol=1e-12)
+    np.testing.assert_allclose(np.abs((vectors * expected).sum(axis=1)), 1, atol=1e-9)
+
+
+def test_no_vectors_is_kmeans_from_the_same_start() -> None:
+    signal = surface_signal(1500, 8)
+    start = signal[np.random.default_rng(3).permutation(len(signal))[:12]]
+    theirs = KMeans(12, init=start.astype(float), n_init=1, max_iter=1000, tol=0, algorithm="lloyd").fit(signal.astype(float))
+    labels = lbg(signal, start, 1000)
+    assert (labels == theirs.labels_).mean() > 0.998
+    encoded = vector_quantization(signal, 12, seed=3, iterations=1000)
+    assert encoded.weights.shape == (1500, 0)
+    nearest = ((signal[:, None].astype(float) - encoded.bases[None, :, 0]) ** 2).sum(axis=2)
+    assert (nearest.argmin(axis=1) == encoded.cluster).mean() > 0.998, "not a fixed point"
+
+
+def test_iterative_without_vectors_is_a_kmeans_fixed_point() -> None:
+    signal = surface_signal(1500, 8)
+    encoded = encode(signal, EncoderSettings(12, 0, iterations=200, tolerance=0.0))
+    again = KMeans(12, init=encoded.bases[:, 0].astype(float), n_init=1, max_iter=300, tol=0).fit(signal.astype(float))
+    assert again.inertia_ == pytest.approx(encoded.squared_error, rel=1e-3)
+
+
+@pytest.mark.parametrize("vectors", [0, 1, 4])
+@pytest.mark.parametrize("rows", [7, 256])
+def test_reclassification_equals_brute_force(vectors: int, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    signal = surface_signal(3000, 12)
+    state = from_labels(np.random.default_rng(1).integers(0, 30, 3000).astype(np.int32), 30, 12, vectors)
+    monkeypatch.setattr(classification, "ROWS", rows)
+    for sweep in range(6):
+        if sweep == 3 and vectors:
+            state.vectors = np.random.default_rng(2).integers(0, vectors + 1, 30)
+        update(signal, state)
+        occupied = state.counts > 0
+        squared = brute_squared_distances(signal, list(state.means), [b[:v] for b, v in zip(state.bases, state.vectors, strict=True)])
+        squared[:, ~occupied] = np.inf
+        reclassify(signal, state)
+        chosen = squared[np.arange(3000), state.labels]
+        assert (chosen - squared.min(axis=1)).max() < 1e-5 * squared[:, occupied].mean()
+        assert (squared.argmin(axis=1) == state.labels).mean() > 0.998
+
+
+def test_update_converges_to_the_svd_and_never_raises_the_error() -> None:
+    signal = surface_signal(2000, 20)
+    labels = np.random.default_rng(1).integers(0, 5, 2000).astype(np.int32)
+    state = from_labels(labels, 5, 20, 3)
+    errors = [update(signal, state) for _ in range(40)]
+    exact = sum(svd_fit(signal[labels == k], 0)[2][3:].sum() for k in range(5))
+    assert errors[-1] == pytest.approx(exact, rel=1e-4)
+    assert all(after <= before * (1 + 1e-5) for before, after in zip(errors, errors[1:], strict=False))
+
+
+@pytest.mark.parametrize("case", [(2000, 16, 12, 2), (1500, 9, 20, 1), (1500, 25, 10, 4), (1200, 12, 16, 3)])
+def test_never_worse_than_the_papers_procedure(case: tuple[int, int, int, int]) -> None:
+    points, values, clusters, vectors = case
+    for seed in range(2):
+        signal = surface_signal(points, values, seed)
+        ours = encode(signal, EncoderSettings(clusters, vectors)).squared_error
+        assert ours <= papers_procedure(signal, clusters, vectors, seed)
+
+
+def test_order_of_the_methods() -> None:
+    signal = surface_signal(4000, 25)
+    static, iterative, adaptive = (encode(signal, EncoderSettings(40, 3, method)) for method in METHODS)
+    assert iterative.squared_error < 0.9 * static.squared_error
+    assert adaptive.squared_error <= iterative.squared_error
+    assert (adaptive.vectors_per_cluster[adaptive.cluster]).mean() <= 3
+    assert adaptive.storage_cost == (adaptive.vectors_per_cluster[adaptive.cluster].sum()
+                                     + (adaptive.vectors_per_cluster + 1).sum() * 25)
+    assert iterative.storage_cost == 4000 * 3 + 40 * 4 * 25
+
+
+def test_metric_is_minimised_and_measured() -> None:
+    generator = np.random.default_rng(5)
+    root = np.diag([5.0, 1.0, 0.1, 1.0]) @ np.linalg.qr(generator.normal(size=(4, 4)))[0]
+    metric = root.T @ root
+    signal = surface_signal(2000, 24)
+    plain, fitted = (encode(signal, EncoderSettings(16, 2), chosen) for chosen in (None, metric))
+
+    def seen(decoded: NDArray) -> float:
+        difference = (decoded - signal).astype(float).reshape(-1, 4, 6)
+        return float(np.einsum("pij,ik,pkj->", difference, metric, difference))
+    assert fitted.squared_error == pytest.approx(seen(fitted.decode()), rel=1e-3)
+    assert fitted.squared_error < 0.9 * seen(plain.decode())
+    with pytest.raises(PRTError, match="metric"):
+        encode(signal, EncoderSettings(4, 1), -np.eye(4))
+    with pytest.raises(PRTError, match="metric"):
+        encode(signal, EncoderSettings(4, 1), np.eye(5))
+
+
+@pytest.mark.parametrize("target", [1e-1, 1e-3, 1e-5])
+@pytest.mark.parametrize("method", METHODS[1:])
+def test_target_error_spends_less_where_the_signal_is_simple(target: float, method: str) -> None:
+    signal = surface_signal(3000, 16)
+    full = encode(signal, EncoderSettings(200, 4, method))
+    enough = encode(signal, EncoderSettings(200, 4, method, target_error=target))
+    assert full.relative_error < target
+    assert enough.relative_error <= target
+    assert enough.storage_cost < full.storage_cost
+
+
+def test_simple_signals_get_few_clusters() -> None:
+    generator = np.random.default_rng(0)
+    plane = (generator.normal(size=(2000, 2)) @ generator.normal(size=(2, 16)) + 1).astype(np.float32)
+    result = encode(plane, EncoderSettings(64, 4, target_error=1e-6))
+    assert len(result.bases) == 1
+    assert result.vectors_per_cluster.tolist() == [2]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("vectors", [0, 2])
+@pytest.mark.parametrize("signal", [
+    np.zeros((100, 5)), np.full((100, 5), 7.5), np.ones((1, 5)), np.arange(6.0).reshape(6, 1),
+    np.arange(12.0).reshape(3, 4), np.repeat(np.eye(4), 25, axis=0), np.random.default_rng(0).normal(size=(200, 1)),
+    np.random.default_rng(0).normal(size=(200, 3)) * 1e-25, np.random.default_rng(0).normal(size=(200, 3)) * 1e25,
+], ids=["zero", "constant", "one point", "one value", "few points", "duplicates", "scalars", "tiny", "huge"])
+def test_degenerate_signals(signal: NDArray, vectors: int, method: str) -> None:
+    signal = signal.astype(np.float32)
+    result = encode(signal, EncoderSettings(8, vectors, method))
+    decoded = result.decode()
+    assert np.isfinite(result.bases).all() and np.isfinite(result.weights).all()
+    assert result.cluster.shape == (len(signal),) and result.cluster.max() < len(result.bases) <= 8
+    spread = ((signal.astype(float) - signal.mean(axis=0, dtype=float)) ** 2).sum()
+    error = ((decoded.astype(float) - signal) ** 2).sum()
+    assert error <= 0.4 * spread + 1e-12 * (signal.astype(float) ** 2).sum()
+    used = np.arange(result.bases.shape[1] - 1) < result.vectors_per_cluster[:, None]
+    assert not result.bases[:, 1:][~used].any()
+
+
+@pytest.mark.parametrize("method", METHODS[1:])
+def test_points_of_very_different_scale(method: str) -> None:
+    signal = surface_signal(1000, 8)
+    signal[:10] *= 1e4
+    result = encode(signal, EncoderSettings(12, 2, method))
+    small = ((result.decode()[10:].astype(float) - signal[10:]) ** 2).sum() / (signal[10:].astype(float) ** 2).sum()
+    assert small < 0.2
+
+
+def test_unusable_input_is_told() -> None:
+    signal = surface_signal(100, 4)
+    signal[37, 2] = np.nan
+    with pytest.raises(PRTError, match="point 37"):
+        encode(signal, EncoderSettings(4, 1))
+    with pytest.raises(PRTError, match="shape"):
+        encode(np.zeros((0, 4), np.float32), EncoderSettings(4, 1))
+    for wrong in ({"clusters": 0}, {"vectors": -1}, {"method": "magic"}, {"iterations": 0}, {"target_error": -1.0},
+                  {"vectors_limit": 1}, {"tolerance": float("nan")}):
+        with pytest.raises(BadArguments):
+            EncoderSettings(**wrong)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_same_seed_same_result(method: str) -> None:
+    signal = surface_signal(1500, 12)
+    first, second = (encode(signal.copy(), EncoderSettings(16, 2, method, seed=9)) for _ in range(2))
+    np.testing.assert_array_equal(first.cluster, second.cluster)
+    np.testing.assert_array_equal(first.bases, second.bases)
+    np.testing.assert_array_equal(first.weights, second.weights)
+
+
+def test_result_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    signal = surface_signal(1500, 12)
+    whole = encode(signal, EncoderSettings(16, 2))
+    monkeypatch.setattr(classification, "ROWS", 31)
+    monkeypatch.setattr(classification, "BLOCK", 3)
+    parts = encode(signal, EncoderSettings(16, 2))
+    assert (whole.cluster == parts.cluster).mean() > 0.995
+    assert parts.squared_error == pytest.approx(whole.squared_error, rel=1e-3)
+    monkeypatch.setattr(frames, "CHUNK", 100)
+    frame = frames.global_frame(signal)
+    back = frame.coordinates @ frame.backward + frame.mean
+    np.testing.assert_allclose(back, signal, atol=1e-5)
+    assert frame.tail[0] * frame.scale**2 == pytest.approx(
+        ((signal - signal.mean(axis=0, dtype=float)) ** 2).sum(), rel=1e-5)
+
+
+def test_progress_rises_and_may_cancel() -> None:
+    signal = surface_signal(1500, 12)
+    seen: list[float] = []
+    result = encode(signal, EncoderSettings(16, 3, "adaptive"), progress=seen.append)
+    assert seen == sorted(seen) and seen[-1] == 1.0 and len(seen) > 4
+    errors = [error for _, _, error in result.history]
+    assert errors[-1] == pytest.approx(result.squared_error)
+    assert [seconds for seconds, _, _ in result.history] == sorted(seconds for seconds, _, _ in result.history)
+
+    def stop(fraction: float) -> None:
+        raise Cancelled("bake", "stopped", "Run it again")
+    with pytest.raises(Cancelled):
+        encode(signal, EncoderSettings(16, 3), progress=stop)
+
+
+def test_distribution_keeps_to_the_budget_and_the_order() -> None:
+    gains = np.array([[100.0, 50.0, 1.0], [10.0, 9.0, 0.0], [40.0, 0.5, 0.1]])
+    counts = np.array([10, 10, 20])
+    np.testing.assert_array_equal(distribute(gains, counts, 40), [2, 0, 1])
+    np.testing.assert_array_equal(distribute(gains, counts, 60), [2, 2, 1])
+    np.testing.assert_array_equal(distribute(gains, counts, 10_000), [3, 2, 3])
+
+
+def test_even_clusters_do_not_pay_for_adaptation() -> None:
+    spectrum = 0.5 ** np.arange(6.0)
+    even = np.tile(spectrum, (10, 1))
+    counts = np.full(10, 100)
+    errors = even[:, 2:].sum(axis=1)
+    assert not adaptation_pays(errors, counts, even, 2)
+    uneven = even * np.logspace(-3, 1, 10)[:, None]
+    assert adaptation_pays(uneven[:, 2:].sum(axis=1), counts, uneven, 2)
+
+
+def test_overdraw_counts_clusters_of_triangles() -> None:
+    triangles = np.array([[0, 1, 2], [1, 2, 3], [3, 4, 5]])
+    assert overdraw(triangles, np.array([0, 0, 0, 0, 0, 0])) == 1
+    assert overdraw(triangles, np.array([0, 0, 0, 1, 2, 0])) == pytest.approx((1 + 2 + 3) / 3)
+    assert overdraw(np.zeros((0, 3), int), np.array([0])) == 1

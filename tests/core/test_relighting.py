@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Relighting in two steps equals decompressing M_p in double precision and multiplying it by the light."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from prt_addon.relighting.exit_radiance import cluster_constants, diffuse_radiance, exit_radiance
+
+
+def random_baked(points: int, clusters: int, vectors: int, rows: int, columns: int, channels: int) -> SimpleNamespace:
+    random = np.random.default_rng(points + vectors + rows + channels)
+    return SimpleNamespace(
+        cluster=random.integers(0, clusters, points).astype(np.int32),
+        weights=random.normal(size=(points, vectors)).astype(np.float32),
+        bases=random.normal(size=(clusters, vectors + 1, rows, columns, channels)).astype(np.float32),
+        albedo=random.uniform(size=(points, 3)).astype(np.float32),
+        light=random.normal(size=(columns, 3)),
+    )
+
+
+def full_product(baked: SimpleNamespace) -> np.ndarray:
+    """M_p l with M_p (rows, columns, channels) made explicit for every point."""
+    bases, weights = baked.bases.astype(np.float64), baked.weights.astype(np.float64)
+    result = []
+    for point, cluster in enumerate(baked.cluster):
+        matrix = bases[cluster, 0] + np.tensordot(weights[point], bases[cluster, 1:], axes=1)
+        matrix = np.broadcast_to(matrix, (*matrix.shape[:2], 3))  # a neutral transfer serves all three channels
+        result.append(np.stack([matrix[:, :, k] @ baked.light[:, k] for k in range(3)], axis=1))
+    return np.array(result)
+
+
+@pytest.mark.parametrize("vectors", [0, 1, 8])
+@pytest.mark.parametrize(("rows", "columns", "channels"), [(1, 25, 1), (1, 100, 3), (16, 25, 1), (9, 16, 3)])
+def test_two_steps_equal_the_full_product(vectors: int, rows: int, columns: int, channels: int) -> None:
+    baked = random_baked(300, 12, vectors, rows, columns, channels)
+    constants = cluster_constants(baked.bases, baked.light)
+    assert constants.shape == (12, vectors + 1, rows, 3) and constants.dtype == np.float32
+    radiance = exit_radiance(baked.cluster, baked.weights, constants)
+    assert radiance.shape == (300, rows, 3) and radiance.dtype == np.float32
+    expected = full_product(baked)
+    assert np.abs(radiance - expected).max() < 5e-6 * np.abs(expected).max()
+
+
+def test_a_points_value_does_not_depend_on_the_other_points() -> None:
+    baked = random_baked(5000, 30, 8, 4, 25, 1)
+    constants = cluster_constants(baked.bases, baked.light)
+    whole = exit_radiance(baked.cluster, baked.weights, constants)
+    for size in (1, 7, 1024):
+        parts = [exit_radiance(baked.cluster[s:s + size], baked.weights[s:s + size], constants)
+                 for s in range(0, 500 if size == 1 else 5000, size)]
+        together = np.concatenate(parts)
+        np.testing.assert_array_equal(together, whole[:len(together)])
+
+
+def test_diffuse_radiance_multiplies_by_the_albedo() -> None:
+    baked = random_baked(200, 5, 3, 1, 25, 1)
+    radiance = diffuse_radiance(baked, baked.light)
+    np.testing.assert_allclose(radiance, full_product(baked)[:, 0] * baked.albedo, atol=2e-4)
+    with pytest.raises(ValueError, match="1 row"):
+        diffuse_radiance(random_baked(5, 2, 1, 4, 9, 1), np.zeros((9, 3)))
+
+
+def test_light_is_linear_and_black_light_is_black() -> None:
+    baked = random_baked(100, 5, 3, 1, 25, 3)
+    assert not diffuse_radiance(baked, np.zeros((25, 3))).any()
+    np.testing.assert_array_equal(diffuse_radiance(baked, 2 * baked.light), 2 * diffuse_radiance(baked, baked.light))
+
+
+def test_misfits_are_refused() -> None:
+    baked = random_baked(10, 3, 2, 1, 9, 1)
+    constants = cluster_constants(baked.bases, baked.light)
+    with pytest.raises(ValueError, match="9 columns"):
+        cluster_constants(baked.bases, np.zeros((16, 3)))
+    with pytest.raises(ValueError, match="1 or 3"):
+        cluster_constants(np.zeros((3, 2, 1, 9, 2), np.float32), baked.light)
+    with pytest.raises(ValueError, match="weights"):
+        exit_radiance(baked.cluster, baked.weights[:, :1], constants)
+    with pytest.raises(ValueError, match="cluster indices"):
+        exit_radiance(baked.cluster + 3, baked.weights, constants)
+    assert exit_radiance(np.zeros(0, np.int32), np.zeros((0, 2), np.float32), constants).shape == (0, 1, 3)
+
+
+def test_fifty_thousand_points_take_milliseconds() -> None:
+    baked = random_baked(50_000, 256, 8, 1, 100, 1)
+    seconds = []
+    for _ in range(5):
+        start = time.perf_counter()
+        diffuse_radiance(baked, baked.light)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.1  # 4-10 ms measured; the limit leaves room for a busy machine
