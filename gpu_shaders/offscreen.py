@@ -23,12 +23,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.errors import BadArguments, BadScene, PRTError
+from ..prt_addon.lighting.environment import pixel_of_direction
 from ..prt_addon.storage.files import write_atomically
 from .draw import DrawingCache, read_texture
 from .render_data import LARGEST_TEXTURE, DrawItem
 
 if TYPE_CHECKING:
     from ..prt_addon.storage.container import BakedTransfer
+
+SUBPIXELS = 256  # places per pixel of an environment, as in a GPU's own bilinear filter
 
 
 @functools.cache
@@ -170,6 +173,31 @@ def camera_background(
         directions = far - near
         picture[index] = sample(directions / np.sqrt((directions**2).sum(axis=1, keepdims=True)))
     return picture
+
+
+def environment_sampler(
+    image: NDArray[np.floating], rotation: ArrayLike | None = None
+) -> Callable[[NDArray[np.float64]], NDArray[np.float32]]:
+    """The `sample` of `camera_background` for an equirectangular image (h, w, 3), bilinear like Blender's.
+
+    rotation: (3, 3) R of the environment, f(R^-1 s), as `environment.world_rotation` gives it.
+    """
+    height, width, _ = image.shape
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+
+    def sample(directions: NDArray[np.float64]) -> NDArray[np.float32]:
+        # The pixel in a grid that is SUBPIXELS times finer is a place in pixels: the orientation stays in one module.
+        row, column = pixel_of_direction(directions @ turn, height * SUBPIXELS, width * SUBPIXELS)  # small
+        row, column = (row + 0.5) / SUBPIXELS - 0.5, (column + 0.5) / SUBPIXELS - 0.5
+        top, left = np.floor(row).astype(np.intp), np.floor(column).astype(np.intp)
+        down, right = (row - top)[:, None], (column - left)[:, None]
+        rows = np.clip(top, 0, height - 1), np.clip(top + 1, 0, height - 1)
+        columns = left % width, (left + 1) % width
+        upper = image[rows[0], columns[0]] * (1 - right) + image[rows[0], columns[1]] * right
+        lower = image[rows[1], columns[0]] * (1 - right) + image[rows[1], columns[1]] * right
+        return (upper * (1 - down) + lower * down).astype(np.float32)
+
+    return sample
 
 
 def _unproject(inverse: NDArray[np.float64], columns: NDArray[np.float64], row: float, depth: float) -> NDArray:

@@ -27,6 +27,7 @@ from . import programs
 from .draw import DrawingCache
 from .render_data import DrawItem
 
+SPACE = bpy.types.SpaceView3D
 GetDrawList = Callable[[], Sequence[DrawItem]]
 
 
@@ -49,7 +50,7 @@ class _Viewport:
     """Everything that lives between `enable` and `disable`."""
 
     get_draw_list: GetDrawList
-    handlers: list[tuple[Any, type]] = field(default_factory=list)
+    handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
     framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
     status: ViewportStatus = field(default_factory=lambda: ViewportStatus(enabled=True))
@@ -70,8 +71,7 @@ def enable(get_draw_list: GetDrawList) -> None:
     else:
         _active = _Viewport(get_draw_list)
         for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW")):
-            handle = bpy.types.SpaceView3D.draw_handler_add(handler, (), "WINDOW", phase)
-            _active.handlers.append((handle, bpy.types.SpaceView3D))
+            _active.handlers.append(SPACE.draw_handler_add(handler, (), "WINDOW", phase))
     redraw()
 
 
@@ -80,8 +80,8 @@ def disable() -> None:
     global _active
     if _active is None:
         return
-    for handle, space in _active.handlers:
-        space.draw_handler_remove(handle, "WINDOW")
+    for handle in _active.handlers:
+        SPACE.draw_handler_remove(handle, "WINDOW")
     _active.cache.clear()
     _active = None
     programs.release()
@@ -119,7 +119,7 @@ def _draw_region() -> None:
     if viewport is None or region is None:
         return
     framebuffer = viewport.framebuffers.pop(region.as_pointer(), None)
-    if space.shading.type == "WIREFRAME":  # a filled surface would hide what the user asked to see
+    if _sees_through(space.shading):
         return
     try:
         items = viewport.get_draw_list()
@@ -141,7 +141,7 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
         viewport.cache.draw(items, view_projection)
         return
     with framebuffer.bind():
-        if _depth_is_missing(bpy.context.space_data):
+        if _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
             framebuffer.clear(depth=1.0)
         viewport.cache.draw(items, view_projection)
 
@@ -160,10 +160,16 @@ def _why_not_usable(framebuffer: gpu.types.GPUFrameBuffer | None, region: bpy.ty
     return ""
 
 
-def _depth_is_missing(space: bpy.types.SpaceView3D) -> bool:
-    """Whether the picture's depth is not the scene's.
+def _sees_through(shading: bpy.types.View3DShading) -> bool:
+    """Whether the user asked to look through surfaces: a filled one would hide what is to be seen."""
+    return shading.type == "WIREFRAME" or (shading.type == "SOLID" and shading.show_xray)
 
-    With overlays on they render it themselves. With overlays off, EEVEE leaves 0 everywhere (nothing would pass) and
-    Cycles 1; Workbench writes its own. Where it is missing, other objects can't hide the baked ones.
+
+def _depth_is_missing(space: bpy.types.SpaceView3D, engine: str) -> bool:
+    """Whether the picture's depth is not the scene's. Other objects then can't hide the baked ones.
+
+    Workbench always writes it, other engines only for the overlays: without them EEVEE leaves 0 everywhere, so that
+    nothing would pass, and Cycles 1.
     """
-    return space.shading.type in {"MATERIAL", "RENDERED"} and not space.overlay.show_overlays
+    workbench = space.shading.type == "SOLID" or engine == "BLENDER_WORKBENCH"
+    return not workbench and not space.overlay.show_overlays

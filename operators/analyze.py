@@ -7,7 +7,7 @@ import bpy
 
 from ..prt_addon.baking.settings import make_settings
 from ..prt_addon.errors import PRTError
-from .bake_session import analysis_lines, analyze_scene, selected_targets
+from .bake_session import analysis_lines, analyze_scene
 from .properties import assign, session
 
 
@@ -27,7 +27,7 @@ class PRT_OT_analyze(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
-            analysis = analyze_scene(context.scene, settings, selected_targets(context))
+            analysis = analyze_scene(context.scene, settings(context))
         except PRTError as error:
             assign(session(context), analysis="", message=str(error), failed=True)
             self.report({"ERROR"}, str(error))

@@ -7,7 +7,7 @@ import bpy
 
 from ..prt_addon.baking.settings import make_settings
 from . import live_preview
-from .bake_session import BakeSession, baked_message, selected_targets
+from .bake_session import BakeSession, baked_message
 from .job_mixin import JobMixin
 from .properties import assign, session
 
@@ -35,10 +35,11 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
 
     def start_job(self, context: bpy.types.Context) -> BakeSession:
         settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
-        return BakeSession.start(context.scene, settings, selected_targets(context))
+        return BakeSession.start(context.scene, settings(context))
 
     def finish_job(self, context: bpy.types.Context, job: BakeSession) -> str:
-        result = job.finish()
+        result = job.store()
+        job.discard()
         assign(session(context), seconds=job.seconds)
         live_preview.bakes_changed()
         return baked_message(result, job.seconds)

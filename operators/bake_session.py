@@ -10,22 +10,26 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ..prt_addon.baking import job as jobs
+from ..prt_addon.baking.plan import make_plan
 from ..prt_addon.baking.process import BakeProcess
-from ..prt_addon.baking.recipe import BakeResult, analyze
+from ..prt_addon.baking.recipe import BakeResult
 from ..prt_addon.baking.settings import BakeSettings
+from ..prt_addon.blender.fingerprint import fingerprint, surroundings
+from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
-from ..prt_addon.errors import BadScene
+from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.scene.scene_mesh import SceneMesh
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
+KEPT_DAYS = 14
 
 
 def jobs_folder() -> Path:
@@ -35,51 +39,109 @@ def jobs_folder() -> Path:
     return Path(bpy.utils.user_resource("DATAFILES", path="prt/jobs", create=True))
 
 
-def read_scene(scene: bpy.types.Scene, settings: BakeSettings, targets: Sequence[str] | None) -> SceneMesh:
-    """The scene as it is traced. targets: names of the objects to bake, None for every visible mesh."""
-    names = None if targets is None else list(targets)
-    return SceneMesh.assemble(read_objects(scene, names), settings.spacing)
+def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> SceneMesh:
+    """The scene as it is traced, with what was left out among its warnings. targets: as `read_objects` takes them."""
+    warnings: list[str] = []
+    mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings), settings.spacing)
+    return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 
-def analyze_scene(scene: bpy.types.Scene, settings: BakeSettings, targets: Sequence[str] | None) -> dict[str, Any]:
-    """What a bake of the scene would need, leave out and cost: see `baking.recipe.analyze`."""
-    return analyze(read_scene(scene, settings, targets), settings)
+def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
+                  targets: Sequence[str] | None) -> dict[str, Any]:
+    """What a bake of the scene would need, leave out and cost, as JSON-able values."""
+    scene = read_scene(depsgraph, settings, targets)
+    plan = make_plan(scene, settings, reference_light(depsgraph))
+    return {
+        "objects": [o.name for o in scene.objects if o.is_target],
+        "casters": len(scene.objects),
+        "receivers": plan.receivers,
+        "triangles": len(scene.triangles),
+        "needs": {"shadow_rays": plan.needs.shadow_rays, "bounces": plan.needs.bounces,
+                  "channels": plan.needs.channels, "order": plan.needs.order},
+        "left_out": [asdict(item) for item in plan.needs.left_out],
+        "hints": list(plan.needs.hints),
+        "warnings": list(scene.warnings),
+        "seconds": sum(plan.seconds.values()),
+        "stages": plan.seconds,
+        "rays": sum(plan.rays.values()),
+        "peak_bytes": plan.peak_bytes,
+        "stored_bytes": plan.stored_bytes,
+    }
+
+
+def analysis_lines(analysis: dict[str, Any]) -> list[str]:
+    """An analysis in a few lines for the panel."""
+    lines = [f"About {analysis['seconds']:.0f} s, {analysis['peak_bytes'] / 1e6:.0f} MB while baking, "
+             f"{analysis['stored_bytes'] / 1e6:.1f} MB stored, for {analysis['receivers']:,} receivers"]
+    lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
+    return lines + analysis["hints"] + analysis["warnings"]
 
 
 @dataclass
 class BakeSession:
-    """A bake under way. Poll `process` until it is finished, then `finish`."""
+    """A bake under way. Poll `process` until it is finished, then `store` and `discard`.
+
+    digests: per target by name, and surroundings: of everything, as they were when the scene was read.
+    """
 
     job: Path
     process: BakeProcess
     started: float
+    digests: dict[str, dict[str, str | None]]
+    surroundings: dict[str, str]
 
     @staticmethod
-    def start(scene: bpy.types.Scene, settings: BakeSettings, targets: Sequence[str] | None) -> BakeSession:
-        """Read the scene and start its bake in a child process. Raises PRTError."""
+    def start(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> BakeSession:
+        """Read the scene and start its bake in a child process. targets: None for the selected meshes, or all.
+
+        Raises PRTError.
+        """
         started = time.monotonic()
-        job = jobs.write_job(jobs_folder(), read_scene(scene, settings, targets), settings)
+        scene = read_scene(depsgraph, settings, targets)
+        names = [o.name for o in scene.objects if o.is_target]
+        digests = {name: fingerprint(found, depsgraph)
+                   for name, found in zip(names, find_objects(names, depsgraph.scene), strict=True)}
+        geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
+        folder = jobs_folder()
+        _drop_forgotten(folder)
+        job = jobs.write_job(folder, scene, settings, reference_light(depsgraph), geometry)
         process = BakeProcess([sys.executable, *bpy.app.python_args], job)
         process.start()
-        return BakeSession(job, process, started)
+        return BakeSession(job, process, started, digests, surroundings(depsgraph))
 
     @property
     def seconds(self) -> float:
         """Since the start, reading the scene included."""
         return time.monotonic() - self.started
 
-    def finish(self) -> BakeResult:
-        """Store the child's complete result in the file's data and drop the job folder. Raises PRTError.
+    def store(self) -> BakeResult:
+        """Put the child's complete result into the file's data. Raises PRTError.
 
         Call it after the "done" message. Every object is looked up before the first is written, so that either all
-        are replaced or none.
+        are replaced or none. The job folder stays, so that nothing is lost if the file can't be saved.
         """
         result = jobs.read_result(self.job)
-        objects = {name: bpy.data.objects.get(name) for name in result.objects}
-        missing = [name for name, found in objects.items() if found is None]
-        if missing:
-            raise BadScene(missing[0], "it was removed or renamed while its bake ran", "Undo that, or bake again")
-        for name, baked in result.objects.items():
-            write_baked(objects[name], baked)
-        jobs.discard(self.job)
+        names = list(result.objects)
+        for scene_object, name in zip(find_objects(names, bpy.context.scene), names, strict=True):
+            write_baked(scene_object, result.objects[name], self.digests[name], self.surroundings)
         return result
+
+    def discard(self) -> None:
+        """Drop the job folder."""
+        jobs.discard(self.job)
+
+
+def _drop_forgotten(folder: Path) -> None:
+    """Remove jobs that nobody resumed: an interrupted bake of a scene since edited would lie there for ever."""
+    for job in folder.glob("bake-*"):
+        if time.time() - job.stat().st_mtime > KEPT_DAYS * 86400:
+            jobs.discard(job)
+
+
+def baked_message(result: BakeResult, seconds: float) -> str:
+    """What came out, in a line for the artist."""
+    names = list(result.objects)
+    what = names[0] if len(names) == 1 else f"{len(names)} objects"
+    text = f"Baked {what} in {seconds:.1f} s, {result.report['clusters']['count']} clusters"
+    total = result.report["errors"].get("total")
+    return text if total is None else f"{text}, error {100.0 * total['relative_rms']:.2f} %"

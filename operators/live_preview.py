@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from ..gpu_shaders import viewport
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
 from ..prt_addon.basis.spherical_harmonics import order_of, rotate
+from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
-from ..prt_addon.blender.stored import baked_objects, read_baked, stale
+from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
@@ -37,7 +38,6 @@ class Shown:
 
     baked: BakedTransfer
     key: Hashable
-    to_bake: NDArray[np.float64]  # (4, 4) from world space to the object's space when baked
     stale: bool = False
 
 
@@ -51,6 +51,7 @@ class Live:
     signature: Hashable = None
     rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
     light_seconds: float = 0.0
+    stale_seconds: float = 0.0
     bakes_dirty: bool = True
     light_dirty: bool = True
     stale_dirty: bool = True
@@ -90,7 +91,7 @@ def draw_list() -> list[DrawItem]:
         found = bpy.data.objects.get(name)
         if found is None or found.mode != "OBJECT" or not found.visible_in_viewport_get(space):
             continue
-        moved = np.array(found.matrix_world, np.float64) @ shown.to_bake  # small
+        moved = transform_since_bake(found, shown.baked.header)
         items.append(DrawItem(shown.key, shown.baked, moved, _light_in(moved), exposure, shown.stale))
     return items
 
@@ -124,22 +125,24 @@ def _read_bakes() -> None:
             continue
         line.clusters, line.points = int(baked.bases.shape[0]), len(baked.cluster)
         line.error = float(baked.header.get("errors", {}).get("total", -1.0))
-        to_bake = np.linalg.inv(np.reshape(baked.header["matrix"], (4, 4)))  # small
-        _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)), to_bake)
+        _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)))
     _read_stale()
 
 
 def _read_stale() -> None:
     """Compare the baked objects with what they were baked from."""
     _live.stale_dirty = False
+    started = time.perf_counter()
     depsgraph = bpy.context.evaluated_depsgraph_get()
+    around = surroundings(depsgraph)
     for line in session().objects:
         found, shown = bpy.data.objects.get(line.name), _live.shown.get(line.name)
         if found is None or shown is None:
             continue
-        why = stale(found, depsgraph) or ""
+        why = stale(found, depsgraph, around) or ""
         shown.stale = bool(why)
         assign(line, stale=why)
+    _live.stale_seconds = time.perf_counter() - started
 
 
 def _read_light() -> None:
@@ -199,7 +202,7 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
     if _live.light_dirty and session().preview:
         _schedule(max(SHORTEST_WAIT, _live.light_seconds))
     elif _live.stale_dirty:
-        _schedule(STALE_WAIT)
+        _schedule(max(STALE_WAIT, 4.0 * _live.stale_seconds))
 
 
 @persistent

@@ -20,6 +20,7 @@ import numpy as np
 from ..prt_addon.baking.process import raise_error
 from ..prt_addon.baking.settings import BakeSettings, make_settings
 from ..prt_addon.basis.spherical_harmonics import order_of
+from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import Light, light_coefficients
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale
@@ -38,8 +39,8 @@ PROGRESS_SECONDS = 1.0  # between two lines of progress of one stage
 def analyze(arguments: argparse.Namespace) -> Iterator[str]:
     """JSON: what the scene needs, what is left out and why, expected seconds and bytes."""
     settings = _settings(arguments)
-    scene = _open(arguments.input)
-    yield json.dumps(analyze_scene(scene, settings, arguments.objects), indent=1)
+    _open(arguments.input)
+    yield json.dumps(analyze_scene(bpy.context.evaluated_depsgraph_get(), settings, arguments.objects), indent=1)
 
 
 def bake(arguments: argparse.Namespace) -> Iterator[str]:
@@ -48,8 +49,8 @@ def bake(arguments: argparse.Namespace) -> Iterator[str]:
     _check_output(arguments.output, (".blend",), arguments.input)
     if arguments.report is not None:
         _check_output(arguments.report, (".json",), arguments.input)
-    scene = _open(arguments.input)
-    session = BakeSession.start(scene, settings, arguments.objects)
+    _open(arguments.input)
+    session = BakeSession.start(bpy.context.evaluated_depsgraph_get(), settings, arguments.objects)
     try:
         _follow(session)
     finally:
@@ -92,7 +93,7 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
     percentage = scene.render.resolution_percentage / 100.0
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
                                        max(1, round(scene.render.resolution_y * percentage)))
-    placed = [(b, _moved(bpy.data.objects[name], b)) for name, b in baked.items()]
+    placed = [(b, np.eye(4)) for b in baked.values()]  # small: a bake that was moved is stale and refused
     picture = offscreen.draw_camera(scene, placed, light.coefficients, width, height)
     offscreen.write_png(arguments.output, picture, scene)
     yield str(arguments.output)
@@ -158,7 +159,7 @@ def _open(path: Path) -> bpy.types.Scene:
         bpy.ops.wm.open_mainfile(filepath=str(path.absolute()), load_ui=False, use_scripts=False)
     except RuntimeError as error:
         cause = " ".join(str(error).removeprefix("Error:").split()).rstrip(".")
-        raise StorageError(str(path), f"Blender can't open it ({cause})", "Give a .blend file of this version") from error
+        raise StorageError(str(path), f"Blender can't open it ({cause})", "Give an intact .blend file") from error
     return bpy.context.scene
 
 
@@ -201,12 +202,13 @@ def _follow(session: BakeSession) -> None:
 def _read_all(scene: bpy.types.Scene, path: Path) -> dict[str, BakedTransfer]:
     """The baked data of all objects by name. Raises where there is none, or where it is stale: never silently used."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
+    around = surroundings(depsgraph)
     found: dict[str, BakedTransfer] = {}
     for baked_object in baked_objects(scene):
         transfer = read_baked(baked_object)
         if transfer is None:
             continue
-        why = stale(baked_object, depsgraph)
+        why = stale(baked_object, depsgraph, around)
         if why:
             raise BadScene(baked_object.name, f"its bake is stale: {why}", "Bake it again")
         found[baked_object.name] = transfer
@@ -226,11 +228,6 @@ def _light(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: a
     for warning in light.warnings:
         print(f"prt: warning: {warning}", file=sys.stderr, flush=True)
     return light
-
-
-def _moved(baked_object: bpy.types.Object, baked: BakedTransfer) -> np.ndarray:
-    """(4, 4) from world space when baked to world space now."""
-    return np.array(baked_object.matrix_world) @ np.linalg.inv(np.reshape(baked.header["matrix"], (4, 4)))  # small
 
 
 def _file_name(name: str) -> str:

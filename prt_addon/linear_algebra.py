@@ -18,6 +18,8 @@ from scipy.sparse import csr_array
 
 Array = NDArray[np.floating]
 
+_SINGLE = np.dtype(np.float32)
+
 
 def _same_type(*arrays: Array) -> np.dtype:
     """float32 when every array is float32, else float64: no product silently loses precision."""
@@ -26,9 +28,10 @@ def _same_type(*arrays: Array) -> np.dtype:
 
 def _operand(matrix: Array) -> tuple[Array, int]:
     """The Fortran-ordered array and the transpose flag that stand for `matrix` as BLAS's transposed operand."""
-    if matrix.flags.c_contiguous:
+    flags = matrix.flags
+    if flags.c_contiguous:
         return matrix.T, 0
-    if matrix.flags.f_contiguous:
+    if flags.f_contiguous:
         return matrix, 1
     return np.ascontiguousarray(matrix).T, 0
 
@@ -38,6 +41,12 @@ def multiply(a: Array, b: Array, out: Array | None = None, accumulate: bool = Fa
 
     out: a C-ordered (m, n) array of the product's type to write into; accumulate adds to it instead of replacing it.
     """
+    if a.dtype == _SINGLE and b.dtype == _SINGLE and out is None and a.ndim == b.ndim == 2 and a.size and b.size \
+            and a.shape[1] == b.shape[0]:
+        # The same as below for the many small products of the encoders, where the checks would cost as much again.
+        right, right_flag = _operand(b)
+        left, left_flag = _operand(a)
+        return blas.sgemm(1.0, right, left, trans_a=right_flag, trans_b=left_flag).T
     kind = _same_type(a, b)
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[0]:
         raise ValueError(f"multiply: shapes {a.shape} and {b.shape} do not fit")
@@ -102,6 +111,13 @@ def small_symmetric_eigenpairs(matrix: Array) -> tuple[Array, Array]:
     if status != 0:
         raise ValueError(f"small_symmetric_eigenpairs: LAPACK's dsyevd ended with {status}")
     return values[::-1], vectors[:, ::-1]
+
+
+def small_generalized_eigenpairs(a: Array, b: Array) -> tuple[Array, Array] | None:
+    """Solutions of a v = value b v for small symmetric matrices, in double precision: values descending (n,), vectors
+    as columns with v^T b v = 1. None where b is not positive definite, which callers meet by a sturdier way."""
+    values, vectors, status = lapack.dsygvd(a, b)
+    return None if status != 0 else (values[::-1], vectors[:, ::-1])
 
 
 def row_squares(a: Array) -> Array:

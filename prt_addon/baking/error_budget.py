@@ -56,7 +56,7 @@ def error_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
         banded = multiply(evaluate(order, directions), coefficients)
         return np.stack([banded, light.radiance(directions)], axis=1)
 
-    suns = DistantSuns(light.sun_directions, light.sun_irradiance)
+    suns = DistantSuns(light.sun_directions, light.sun_irradiance, light.sun_angles)
     before = tracer.rays
     halves = yield from reference_radiance(tracer, scene, receivers, albedo, emission, suns, paths, bounces, seed)
     rays = tracer.rays - before

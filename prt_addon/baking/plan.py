@@ -18,6 +18,8 @@ PATH_RAYS_PER_SECOND = 0.8e6
 SECONDS_PER_BOUNCED_VALUE = 2e-8
 SECONDS_PER_ENCODED_VALUE = 1.2e-8
 BYTES_PER_RAY_HIT = 24
+# Smaller clusters cost more in bases, and in constants at each light change, than their points save.
+RECEIVERS_PER_CLUSTER = 24
 # The part of a hemisphere that shows surfaces, before anything is traced: between an open statue and a room.
 TYPICAL_HIT_SHARE = 0.5
 
@@ -63,3 +65,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     return Plan(needs, receivers, seconds, rays, peak, int(stored))
 
 
+
+
+def most_clusters(asked: int, receivers: int) -> int:
+    """Clusters that an object of so many receivers may have."""
+    return max(1, min(asked, -(-receivers // RECEIVERS_PER_CLUSTER)))

@@ -34,7 +34,7 @@ from ..transport.gather import Gather, gather_operator
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
-from .plan import Plan, make_plan
+from .plan import Plan, make_plan, most_clusters
 from .results import object_container, report_of, stability_of
 from .settings import BakeSettings
 
@@ -213,7 +213,7 @@ class _Bake:
             signal = transfer[target.points][~self.scene.loose[target.points]]
             state = _EncodeState()
             with ThreadPoolExecutor(1) as pool:
-                future = pool.submit(encode, signal.reshape(len(signal), -1), self._encoder_settings(), None,
+                future = pool.submit(encode, signal.reshape(len(signal), -1), self._encoder_settings(len(signal)), None,
                                      state.report)
                 try:
                     while True:
@@ -226,10 +226,11 @@ class _Bake:
                     state.cancelled = True
         return encodings
 
-    def _encoder_settings(self) -> EncoderSettings:
+    def _encoder_settings(self, receivers: int) -> EncoderSettings:
         settings = self.settings
         target = settings.compression_error ** 2 if settings.compression_error > 0.0 else None
-        return EncoderSettings(settings.clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
+        clusters = most_clusters(settings.clusters, receivers)
+        return EncoderSettings(clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
                                vectors_limit=24 if settings.encoder == "adaptive" else None)
 
     def _errors(self, transfer: NDArray[np.float32], encodings: dict[str, Encoding],

@@ -19,7 +19,7 @@ from ..storage.container import BakedTransfer, make_header
 from ..storage.digests import digest_json
 from ..transport.gather import Gather
 from ..transport.interreflection import LARGEST_ALBEDO, Interreflection
-from .plan import Plan
+from .plan import Plan, most_clusters
 from .settings import BakeSettings
 
 REPORT_SCHEMA = 1
@@ -78,7 +78,7 @@ def stability_of(scene: SceneMesh, transfer: NDArray[np.float32], keys: NDArray[
             mine = (keys >= target.points.start) & (keys < target.points.stop)
             dark = float(np.mean(white[mine] < 1e-3)) if mine.any() else 0.0
             checks.append(_check(f"receivers of {target.name} that no light reaches", dark, DARK_LIMIT, "ok",
-                                 "normals may point inwards: recalculate them"))
+                                 "in the dark, or its normals point inwards: recalculate them"))
     if gathered is not None:
         checks.append(_check("bounce rays that met receivers left out", gathered.lost_share, 0.02, "ok",
                              "bounced light is missing there: surfaces seen from behind, or many mirrors of backs"))
@@ -139,10 +139,11 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
                              f"backs fill {gathered.back_share:.2%} of the mean receiver's hemisphere",
                              "a second receiver at each point seen from behind"))
     for name, encoding in encodings.items():
-        used = len(encoding.vectors_per_cluster)
+        used, most = len(encoding.vectors_per_cluster), most_clusters(settings.clusters, len(encoding.cluster))
         if used < settings.clusters:
-            found.append(LeftOut(f"{settings.clusters - used} of {settings.clusters} clusters of {name}",
-                                 "the asked compression error is reached without them, or receivers are few",
+            why = (f"{len(encoding.cluster)} receivers fill no more" if used == most else
+                   f"the compression error {encoding.relative_error ** 0.5:.1e} is reached without them")
+            found.append(LeftOut(f"{settings.clusters - used} of {settings.clusters} clusters of {name}", why,
                                  f"{1 - used / settings.clusters:.0%} of bases and of work per light change"))
     return found
 

@@ -48,11 +48,13 @@ def emit(message_type: str, **values: Any) -> None:
 def die_with_parent() -> None:
     """End at once when the parent closes our input or dies: finished stages are on disk, so nothing is lost.
 
-    Its own thread, because the main thread may be inside a long call.
+    Its own thread, because the main thread may be inside a long call. It reads the bare descriptor: the lock of a
+    buffered sys.stdin held at the interpreter's end aborts the process.
     """
 
     def watch() -> None:
-        sys.stdin.buffer.read()
+        while os.read(0, 1):
+            pass
         os._exit(3)
 
     threading.Thread(target=watch, daemon=True, name="parent watch").start()

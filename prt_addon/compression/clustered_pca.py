@@ -12,7 +12,7 @@ from .global_frame import GlobalFrame
 from .reclassify import reclassify
 from .seeding import split_seeds
 from .settings import EncoderSettings
-from .subspaces import SPARE, Single, Subspaces, from_labels, update
+from .subspaces import SPARE, Subspaces, from_labels, update
 from .vector_quantization import lbg, random_means
 
 # Energy that the values left out may hold, relative to the current squared error.
@@ -30,22 +30,21 @@ def static_labels(frame: GlobalFrame, settings: EncoderSettings) -> NDArray[np.i
     return lbg(data, random_means(data, settings.clusters, generator), settings.iterations)
 
 
-def working(frame: GlobalFrame, error: float) -> Single:
-    """The leading values that leave out a tenth of a squared error: (p, d), a view of all rows."""
-    return frame.coordinates[:, :frame.leading(TRUNCATION * error)]
-
-
 def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float) -> Subspaces:
     """Subspaces from best-first splits.
 
     With a target, splits are judged with all vectors and end where the target is met, so that a simple signal gets few
-    clusters; otherwise with SEED_VECTORS. As the error after seeding is unknown, a guess sets the values worked on.
+    clusters; otherwise with SEED_VECTORS.
     """
     vectors = settings.vectors if settings.target_error is not None else min(SEED_VECTORS, settings.vectors)
-    guess = frame.tail[min(vectors + 4, len(frame.tail) - 1)] * 0.05
-    data = working(frame, enough if settings.target_error is not None else guess)
-    labels = split_seeds(data, settings.clusters, vectors, enough - frame.tail[data.shape[1]])
-    return from_labels(labels, int(labels.max()) + 1, data.shape[1], vectors)
+    if settings.target_error is not None:
+        width = frame.leading(TRUNCATION * enough)
+        labels = split_seeds(frame.coordinates, settings.clusters, vectors, enough - frame.tail[width], lambda _: width)
+    else:
+        labels = split_seeds(frame.coordinates, settings.clusters, vectors, enough,
+                             lambda error: frame.leading(TRUNCATION * error))
+    state = from_labels(labels, int(labels.max()) + 1, 1, vectors)
+    return state
 
 
 def random_start(frame: GlobalFrame, settings: EncoderSettings, number: int) -> Subspaces:
@@ -62,19 +61,17 @@ def converge(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, to
     values: how many leading values to work on; None takes what the current error asks for. The error returned counts
     the energy left out as error, so it bounds the true one from above.
     """
-    last = np.inf
+    last, error = np.inf, state.error + frame.tail[state.means.shape[1]]
     for _ in range(settings.iterations):
-        width = state.means.shape[1]
+        width = values or max(state.means.shape[1], frame.leading(TRUNCATION * error))
+        grown = width > state.means.shape[1]
+        if grown:
+            state.resize(width, state.bases.shape[1])
         error = update(frame.coordinates[:, :width], state) + frame.tail[width]
-        wanted = max(width, frame.leading(TRUNCATION * error)) if values is None else values
-        if wanted != width:
-            state.resize(wanted, state.bases.shape[1])
-            error = update(frame.coordinates[:, :wanted], state) + frame.tail[wanted]
-            last = np.inf
-        if error >= last * (1 - tolerance):
+        if error >= last * (1 - tolerance) and not grown:
             break
         last = error
-        if reclassify(frame.coordinates[:, :state.means.shape[1]], state) == 0:
+        if reclassify(frame.coordinates[:, :width], state) == 0:
             break
     return error
 

@@ -55,10 +55,10 @@ def reclassify(data: Single, state: Subspaces) -> int:
     labels = state.labels.copy()
     for first in range(0, len(members), BLOCK):
         block = range(first, min(first + BLOCK, len(members)))
-        offsets = _offsets(state, bases, block)
-        for cluster, offset in zip(block, offsets, strict=True):
+        offsets, apart = _offsets(state, bases, block), _mean_distances(state.means, block)
+        for cluster, offset, distances in zip(block, offsets, apart, strict=True):
             if len(members[cluster]):
-                _reclassify_cluster(data, state, bases, members[cluster], cluster, offset, labels)
+                _reclassify_cluster(data, state, bases, members[cluster], cluster, offset, distances, labels)
     changed = int((labels != state.labels).sum())
     state.labels = labels
     return changed
@@ -74,13 +74,19 @@ def _offsets(state: Subspaces, bases: _Bases, block: range) -> list[Single]:
     return [(products[:, :, i] - bases.mean_weights).astype(np.float32) for i in range(len(block))]
 
 
+def _mean_distances(means: Single, block: range) -> Single:
+    """Squared distances (block, K) between the means of a block of clusters and all means, from double precision."""
+    double = means.astype(np.float64)
+    lengths = row_squares(double)
+    chosen = double[block.start:block.stop]
+    squared = lengths[block.start:block.stop, None] + lengths - 2 * multiply(chosen, double.T)
+    return np.maximum(squared, 0.0).astype(np.float32)
+
+
 def _reclassify_cluster(data: Single, state: Subspaces, bases: _Bases, members: NDArray[np.intp], cluster: int,
-                        offset: Single, labels: NDArray[np.int32]) -> None:
-    """Classify the points of one cluster, writing into labels."""
-    shift = bases.means - bases.means[cluster]
-    apart = row_squares(shift)
-    plane = np.sqrt(np.maximum(apart - row_squares(np.ascontiguousarray(offset.T)), 0.0)) if len(offset) \
-        else np.sqrt(apart)
+                        offset: Single, apart: Single, labels: NDArray[np.int32]) -> None:
+    """Classify the points of one cluster, writing into labels. offset: (q, K); apart: (K,)."""
+    plane = np.sqrt(np.maximum(apart - np.add.reduce(offset * offset, axis=0), 0.0))
     plane[cluster] = np.inf
     plane[state.counts == 0] = np.inf
     weights = state.weights[members]
@@ -91,7 +97,8 @@ def _reclassify_cluster(data: Single, state: Subspaces, bases: _Bases, members: 
         return
     near = near[np.argsort(plane[near], kind="stable")]
     gathered = np.ascontiguousarray(bases.rows[:, near])
-    candidate = _Candidates(near, gathered, shift[near], apart[near], offset[:, near], plane[near])
+    shift = bases.means[near] - bases.means[cluster]
+    candidate = _Candidates(near, gathered, shift, apart[near], offset[:, near], plane[near])
     inner = candidate.inner(state.bases[cluster])
     order = np.argsort(reach, kind="stable")
     for start in range(0, len(order), ROWS):

@@ -8,6 +8,7 @@ the error most puts clusters where the signal bends.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,13 +32,13 @@ class _Leaf:
     halves: tuple[_Leaf, _Leaf] | None = field(compare=False, default=None)
 
 
-def split_points(points: Single, basis: Single, vectors: int) -> tuple[NDArray[np.bool_], Fit, Fit] | None:
+def split_points(points: Single, whole: Fit, vectors: int) -> tuple[NDArray[np.bool_], Fit, Fit] | None:
     """Divide points (m, d) between two subspaces of few vectors; None where they cannot be divided.
 
-    basis: (q, d) start of both subspaces' vectors. The first division is by the sign of the first weight.
+    whole: the fit of all the points. The first division is by the sign of the first weight.
     """
-    weights = fit_subspace(points, basis).weights
-    side = weights[:, 0] > 0
+    basis = whole.basis
+    side = whole.weights[:, 0] > 0
     for _ in range(ROUNDS):
         if not 0 < side.sum() < len(side):
             return None
@@ -56,19 +57,28 @@ def fit_error(fit: Fit, vectors: int) -> float:
     return max(float(fit.squares.sum(dtype=np.float64) - fit.spread[:vectors].sum()), 0.0)
 
 
-def split_seeds(data: Single, clusters: int, vectors: int, enough: float) -> NDArray[np.int32]:
-    """Labels (p,) of at most `clusters` clusters of data (p, d); stops early at a squared error of `enough`."""
-    block = vectors + SPARE
-    start = fit_subspace(data, np.zeros((block, data.shape[1]), np.float32))
-    fit = fit_subspace(data, start.basis)
+def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width: Callable[[float], int]) \
+        -> NDArray[np.int32]:
+    """Labels (p,) of at most `clusters` clusters of data (p, d); stops early at a squared error of `enough`.
+
+    width: how many leading values to work on at a squared error; splits start on few values and get more.
+    """
+    leading = min(width(np.inf) + vectors + SPARE, data.shape[1])
+    basis = np.zeros((vectors + SPARE, leading), np.float32)
+    for _ in range(3):
+        fit = fit_subspace(data[:, :leading], basis)
+        basis = fit.basis
     error = fit_error(fit, vectors)
-    queue = [_Leaf(-error, 0, np.arange(len(data)), fit.basis, error)]
+    queue = [_Leaf(-error, 0, np.arange(len(data)), basis, error)]
     done: list[_Leaf] = []
     made = 1
     while queue and len(queue) + len(done) < clusters and error > enough:
         leaf = heapq.heappop(queue)
         if leaf.halves is None:
-            _judge(data, leaf, vectors, made)
+            leading = max(leading, width(error))
+            error -= leaf.error
+            _judge(data[:, :leading], leaf, vectors, made)
+            error += leaf.error
             if leaf.halves is None or leaf.key >= 0:
                 done.append(leaf)
             else:
@@ -86,8 +96,12 @@ def split_seeds(data: Single, clusters: int, vectors: int, enough: float) -> NDA
 
 
 def _judge(data: Single, leaf: _Leaf, vectors: int, number: int) -> None:
-    """Try to split a leaf: fills its halves and its key, or leaves halves None."""
-    split = split_points(data[leaf.members], leaf.basis, vectors)
+    """Try to split a leaf: fills its halves and its key, or leaves halves None; its error becomes that in data's values."""
+    basis = np.pad(leaf.basis, ((0, 0), (0, data.shape[1] - leaf.basis.shape[1])))
+    points = data[leaf.members]
+    whole = fit_subspace(points, basis)
+    leaf.error = fit_error(whole, vectors)
+    split = split_points(points, whole, vectors)
     if split is None:
         return
     side, left, right = split

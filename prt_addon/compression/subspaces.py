@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..linear_algebra import gram, multiply, row_squares, small_symmetric_eigenpairs
+from ..linear_algebra import multiply, row_squares, small_generalized_eigenpairs, small_symmetric_eigenpairs
 
 # Trailing vectors carried beyond those in use: they speed up the power iteration, are ready when a vector is added, and
 # sharpen the bounds of the reclassification.
@@ -89,7 +89,7 @@ def orthonormal_rows(rows: Single) -> Single:
     for _ in range(2):
         lengths = np.sqrt(row_squares(rows))
         rows = rows / np.where(lengths > 0, lengths, 1)[:, None]
-        values, vectors = small_symmetric_eigenpairs(gram(rows.T).astype(np.float64))
+        values, vectors = small_symmetric_eigenpairs(multiply(rows, rows.T).astype(np.float64))
         kept = values > 1e-5 * max(values[0], 1e-30)
         factors = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1)), 0.0)
         rows = multiply((vectors * factors).T.astype(np.float32), rows)
@@ -101,27 +101,39 @@ def orthonormal_rows(rows: Single) -> Single:
 def fit_subspace(points: Single, start: Single) -> Fit:
     """Fit an affine subspace to points (m, d) by one power step and Rayleigh-Ritz from the rows of start (q, d).
 
-    Rows of start that are zero are first replaced by differences of the points farthest from the mean, so that a block
-    grows into directions that it has not seen.
+    The rows Z of one power step are scaled to unit length; the subspace's best vectors then solve
+    (C Z^T)^T (C Z^T) v = D^2 (Z Z^T) v, C the centred points: orthonormalization and Rayleigh-Ritz in one small problem.
+    Rows of start that are zero are first replaced by differences of the points farthest from the subspace, so that a
+    block grows into directions that it has not seen.
     """
-    mean = points.mean(axis=0)
+    mean = np.add.reduce(points, axis=0)
+    mean /= len(points)
     centred = points - mean
     squares = row_squares(centred)
     if start.shape[0] == 0:
         return Fit(mean, start, np.zeros(0), np.zeros((len(points), 0), np.float32), squares)
     start = _fill(centred, squares, start)
-    basis = orthonormal_rows(multiply(multiply(start, centred.T), centred))
-    weights = multiply(centred, basis.T)
-    spread, rotation = small_symmetric_eigenpairs(gram(weights).astype(np.float64))
-    rotation = rotation.astype(np.float32)
-    return Fit(mean, multiply(rotation.T, basis), np.maximum(spread, 0.0), multiply(weights, rotation), squares)
+    rows = multiply(multiply(start, centred.T), centred)
+    rows /= np.maximum(np.sqrt(row_squares(rows)), np.float32(1e-30))[:, None]
+    overlaps = multiply(rows, rows.T).astype(np.float64)
+    solved = None
+    if 2 * np.abs(overlaps).sum(axis=1).max() < 3:  # diagonally dominant: rounding cannot spoil orthonormality
+        weights = multiply(centred, rows.T)
+        solved = small_generalized_eigenpairs(multiply(weights.T, weights).astype(np.float64), overlaps)
+    if solved is None:
+        rows = orthonormal_rows(rows)
+        weights = multiply(centred, rows.T)
+        solved = small_symmetric_eigenpairs(multiply(weights.T, weights).astype(np.float64))
+    rotation = solved[1].astype(np.float32)
+    return Fit(mean, multiply(rotation.T, rows), np.maximum(solved[0], 0.0), multiply(weights, rotation), squares)
 
 
 def _fill(centred: Single, squares: Single, start: Single) -> Single:
     """Replace zero rows of start by the residuals of the points that start approximates worst."""
-    empty = np.flatnonzero(~start.any(axis=1))
-    if len(empty) == 0 or len(centred) < 2:
+    lengths = row_squares(start)
+    if len(centred) < 2 or lengths.min() > 0:
         return start
+    empty = np.flatnonzero(lengths == 0)
     start = start.copy()
     weights = multiply(centred, start.T)
     worst = np.argsort(-(squares - row_squares(weights)), kind="stable")[:len(empty)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exit radiance of clustered transfer under one light, in two steps (Sloan et al. 2003, section 5, eq. 10).
+"""Exit radiance of clustered transfer under one light, in two steps (Sloan et al. 2003, section 6, rendering).
 
 M_p light = sum_k w_pk (B_ck light): the products in brackets are constants of the cluster, few and computed once per
 light; each point then blends the constants of its own cluster.

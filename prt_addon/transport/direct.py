@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..basis.spherical_harmonics import evaluate, expand_bands, zonal_cosine
 from ..linear_algebra import multiply
 from ..tracing.tracer import Tracer
-from .receiver_set import Block, ReceiverSet, blocks, rotated
+from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated
 
 # Directions per task: long enough to hide a task's overhead behind 64 x 32,000 rays, short enough to cancel at once.
 CHUNK = 64
@@ -79,15 +79,14 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
 def _cosine_visibility(tracer: Tracer, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
                        ) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     """Clamped cosines (d, b), the same where nothing is hit, and the number of rays."""
-    normals = receivers.normals[place].astype(np.float32)
-    cosines = np.maximum(multiply(directions, normals.T), np.float32(0.0))
+    cosines = facing_cosines(directions, receivers.normals[place])
     visible = cosines.copy()
     origins = receivers.origins[place]
     rays = 0
     for index, direction in enumerate(directions):
         facing = np.flatnonzero(cosines[index] > 0.0)
         rays += len(facing)
-        hit = tracer.occluded(origins[facing], direction[None, :])
+        hit = tracer.occluded(np.take(origins, facing, axis=0), direction[None, :])
         visible[index, facing[hit]] = 0.0
     return cosines, visible, rays
 

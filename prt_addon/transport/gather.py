@@ -19,7 +19,7 @@ from scipy import sparse
 from ..linear_algebra import multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
-from .receiver_set import Block, ReceiverSet, blocks, rotated
+from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated
 
 CHUNK = 16
 # Receivers of this many generations are traced for what they see; what the last of them sees beyond is counted as lost.
@@ -147,8 +147,8 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
         # In double, for normalised rows: the sum over the hemisphere is the same whatever the chunk.
         cosines = np.zeros(block.receivers.stop - block.receivers.start)
         for start in range(0, len(turned), CHUNK):
-            part = multiply(turned[start:start + CHUNK], receivers.normals[block.receivers].astype(np.float32).T)
-            cosines += multiply(weights[None, start:start + CHUNK], np.maximum(part, 0.0).astype(np.float64))[0]
+            part = facing_cosines(turned[start:start + CHUNK], receivers.normals[block.receivers])
+            cosines += multiply(weights[None, start:start + CHUNK], part.astype(np.float64))[0]
         scale = (1.0 / np.maximum(cosines, np.finfo(np.float64).tiny)).astype(np.float32)
         for start in range(0, len(turned), CHUNK):
             chunk = slice(start, start + CHUNK)
@@ -160,12 +160,12 @@ def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task)
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
     origins = receivers.origins[place]
-    cosines = multiply(task.directions, receivers.normals[place].astype(np.float32).T)
+    cosines = facing_cosines(task.directions, receivers.normals[place])
     result, rays = _Entries([], [], []), 0
     for index, direction in enumerate(task.directions):
         facing = np.flatnonzero(cosines[index] > 0.0)
         rays += len(facing)
-        hits = tracer.nearest(origins[facing], direction[None, :])
+        hits = tracer.nearest(np.take(origins, facing, axis=0), direction[None, :])
         met = np.flatnonzero(hits.triangle >= 0)
         row = facing[met]
         share = cosines[index, row] * task.weights[index, row]

@@ -33,10 +33,14 @@ Emission = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class DistantSuns:
-    """Directions to suns (s, 3) and their irradiance (s, 3) on a facing surface; they are sampled, not hit by chance."""
+    """Directions to suns (s, 3), their irradiance (s, 3) on a facing surface and full angles (s,) in radians.
+
+    They are sampled, not hit by chance.
+    """
 
     directions: NDArray[np.float64]
     irradiance: NDArray[np.float64]
+    angles: NDArray[np.float64]
 
 
 @dataclass
@@ -86,7 +90,7 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
     first = _stratified(number, count, generator)
     depth = 0
     while len(paths.owner):
-        _add_suns(tracer, paths, suns, total)
+        _add_suns(tracer, paths, suns, total, generator)
         directions = _cosine_directions(paths.normals, first if depth == 0 else generator.random((len(paths.owner), 2)))
         hits = tracer.nearest(paths.origins, directions)
         tracer.rays += len(directions)
@@ -115,15 +119,30 @@ def _cosine_directions(normals: NDArray[np.float64], numbers: NDArray[np.float64
     return np.sum(local[:, :, None] * tangent_frames(normals), axis=1).astype(np.float32)
 
 
-def _add_suns(tracer: Tracer, paths: _Paths, suns: DistantSuns, total: NDArray[np.float64]) -> None:
+def _add_suns(tracer: Tracer, paths: _Paths, suns: DistantSuns, total: NDArray[np.float64],
+              generator: np.random.Generator) -> None:
     """Add each sun's reflected light at the paths' surfaces to the last emission value."""
-    for direction, irradiance in zip(suns.directions, suns.irradiance, strict=True):
-        cosine = np.sum(paths.normals * direction, axis=1)
+    for direction, irradiance, angle in zip(suns.directions, suns.irradiance, suns.angles, strict=True):
+        towards, scale = _disc_directions(direction, float(angle), len(paths.owner), generator)
+        cosine = np.sum(paths.normals * towards, axis=1)
         facing = np.flatnonzero(cosine > 0.0)
-        seen = facing[~tracer.occluded(paths.origins[facing], direction[None, :].astype(np.float32))]
+        seen = facing[~tracer.occluded(paths.origins[facing], towards[facing].astype(np.float32))]
         tracer.rays += len(facing)
         np.add.at(total[:, -1], paths.owner[seen],
-                  paths.throughput[seen] * (cosine[seen, None] / np.pi) * irradiance)
+                  paths.throughput[seen] * (scale * cosine[seen, None] / np.pi) * irradiance)
+
+
+def _disc_directions(direction: NDArray[np.float64], angle: float, count: int, generator: np.random.Generator,
+                     ) -> tuple[NDArray[np.float64], float]:
+    """Directions (count, 3) even over a sun's disc, and solid angle over projected solid angle (1 for a point)."""
+    half = 0.5 * angle
+    numbers = generator.random((count, 2))
+    drop = 2.0 * np.sin(0.5 * half) ** 2 * numbers[:, 0]  # 1 - cos, without cancellation for the real sun
+    radius, turn = np.sqrt(drop * (2.0 - drop)), 2.0 * np.pi * numbers[:, 1]
+    local = np.stack([radius * np.cos(turn), radius * np.sin(turn), 1.0 - drop], axis=1)
+    frame = tangent_frames(direction[None, :])[0]
+    scale = 4.0 * np.sin(0.5 * half) ** 2 / np.sin(half) ** 2 if half > 1e-6 else 1.0
+    return np.sum(local[:, :, None] * frame[None], axis=1), scale
 
 
 def _next(tracer: Tracer, scene: SceneMesh, paths: _Paths, directions: NDArray[np.float32], hits,  # noqa: ANN001

@@ -14,8 +14,9 @@ from ..scene.receivers import morton_order, ray_origins
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 
-# Receivers handled at once: 64 directions of them in single precision are 16 MB per task in flight.
-BLOCK = 65536
+# Receivers handled at once: 64 directions of them in single precision are 4 MB, which the allocator reuses (larger
+# arrays are given back to the system and their pages cleared anew at each task).
+BLOCK = 16384
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class ReceiverSet:
     @staticmethod
     def joined(sets: list[ReceiverSet]) -> ReceiverSet:
         """Sets one after the other (each keeps its own Morton order)."""
-        return ReceiverSet(*(np.concatenate([getattr(s, name) for s in sets]) for name in ("key", "origins", "normals")))
+        names = ("key", "origins", "normals")
+        return ReceiverSet(*(np.concatenate([getattr(s, name) for s in sets]) for name in names))
 
     def __len__(self) -> int:
         return len(self.key)
@@ -64,11 +66,23 @@ class Block:
 
 
 def blocks(count: int, group: int, seed: int) -> Iterator[Block]:
-    """Blocks of at most BLOCK receivers; group > 0 makes blocks of that size, each with a random rotation of its own."""
+    """Blocks of at most BLOCK receivers; group > 0 makes blocks of that size, each with a random rotation."""
     size = min(group, BLOCK) if group > 0 else BLOCK
     for index, start in enumerate(range(0, count, size)):
         rotation = random_rotation(seed, index) if group > 0 else None
         yield Block(slice(start, min(start + size, count)), rotation)
+
+
+def facing_cosines(directions: NDArray[np.float32], normals: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Clamped cosines (d, b) float32 between directions (d, 3) and normals (b, 3).
+
+    Summed by numpy, not by BLAS: three terms gain nothing from it, and numpy lets the other threads trace meanwhile.
+    """
+    x, y, z = normals.astype(np.float32).T
+    cosines = directions[:, :1] * x
+    cosines += directions[:, 1:2] * y
+    cosines += directions[:, 2:] * z
+    return np.maximum(cosines, np.float32(0.0), out=cosines)
 
 
 def rotated(directions: NDArray[np.float64], rotation: NDArray[np.float64] | None) -> NDArray[np.float64]:

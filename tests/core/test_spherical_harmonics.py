@@ -112,7 +112,7 @@ def test_zonal_cosine_is_the_integral_of_the_clamped_cosine() -> None:
 
 
 def test_windows() -> None:
-    for kind in ("hanning", "lanczos", "laplacian"):
+    for kind in ("hanning", "lanczos", "laplacian", "heat"):
         factors = sh.window(8, kind, 0.01)
         assert factors[0] == 1 and np.all(np.diff(factors) < 0) and factors[-1] > 0
     assert np.all(sh.window(8, "none") == 1) and np.all(sh.window(8, "laplacian", 0.0) == 1)

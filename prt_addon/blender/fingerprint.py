@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cheap digests of what a bake depends on, so that an edited scene never shows old light unnoticed."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ..storage.digests import digest_arrays, digest_json
+from .materials import material_digest
+from .visibility import render_visible_objects
+
+# Attributes that shape the surface or its shading normals; UV maps, colours and our own data do not.
+SHAPING = ("position", ".corner_vert", "material_index", "sharp_face", "sharp_edge", "custom_normal")
+BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.float32), "INT": ("value", 1, np.int32),
+           "BOOLEAN": ("value", 1, np.bool_), "INT16_2D": ("value", 2, np.int32)}
+
+
+def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> str | None:
+    """Digest of an object's evaluated geometry in its own space, with all it instances; None if it is not evaluated.
+
+    Changes with vertices, faces, sharpness, custom normals and modifiers, not with the object's place in the world.
+    About 2 ms for 50,000 vertices.
+    """
+    evaluated = scene_object.evaluated_get(depsgraph)
+    if not evaluated.is_evaluated:
+        return None
+    parts = [_mesh_digest(evaluated.data)] if isinstance(evaluated.data, bpy.types.Mesh) else []
+    if not _instances_nothing(evaluated):
+        to_local = np.linalg.pinv(np.array(scene_object.matrix_world, np.float64))  # small
+        cache: dict[int, str] = {}
+        for instance in depsgraph.object_instances:
+            if instance.is_instance and instance.parent.original == scene_object and isinstance(
+                    instance.object.data, bpy.types.Mesh) and not instance.object.original.hide_render:
+                # Rounded: moving the instancer must not count as an edit of what it instances.
+                place = np.round(to_local @ np.array(instance.matrix_world, np.float64), 4) + 0.0  # small
+                pointer = instance.object.data.as_pointer()
+                if pointer not in cache:
+                    cache[pointer] = _mesh_digest(instance.object.data)
+                parts += [cache[pointer], digest_arrays(place)]
+    return digest_json(parts)
+
+
+def _instances_nothing(evaluated: bpy.types.Object) -> bool:
+    return evaluated.type == "MESH" and not evaluated.is_instancer and not evaluated.particle_systems and not any(
+        modifier.type == "NODES" for modifier in evaluated.modifiers)
+
+
+def _mesh_digest(mesh: bpy.types.Mesh) -> str:
+    arrays = []
+    for name in SHAPING:
+        attribute = mesh.attributes.get(name)
+        if attribute is None or attribute.data_type not in BUFFERS:
+            arrays.append(np.zeros(0))
+            continue
+        member, width, kind = BUFFERS[attribute.data_type]
+        values = np.empty(len(attribute.data) * width, kind)
+        attribute.data.foreach_get(member, values)
+        arrays.append(values)
+    starts = np.empty(len(mesh.polygons), np.int32)
+    mesh.polygons.foreach_get("loop_start", starts)
+    return digest_arrays(*arrays, starts)
+
+
+def used_materials(scene_object: bpy.types.Object) -> list[bpy.types.Material | None]:
+    """The materials in an object's slots."""
+    return [slot.material for slot in scene_object.material_slots]
+
+
+def fingerprint(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[str, str | None]:
+    """Digests of an object's geometry and materials, to take when it is read and to hand to `write_baked`."""
+    return {"geometry": geometry_digest(scene_object, depsgraph),
+            "materials": material_digest(used_materials(scene_object))}
+
+
+def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
+    """Digest per render-visible object with geometry of its place and shape: all that can shadow or light another.
+
+    One pass over all meshes; call it once for all baked objects, not per object and redraw.
+    """
+    visible = render_visible_objects(depsgraph.view_layer)
+    parts: dict[str, list[str]] = {}
+    cache: dict[int, str] = {}
+    for instance in depsgraph.object_instances:
+        owner = (instance.parent if instance.is_instance else instance.object).original
+        mesh = instance.object.data
+        if owner.name_full not in visible or not isinstance(mesh, bpy.types.Mesh) or (
+                instance.object.original != owner and instance.object.original.hide_render):
+            continue
+        pointer = mesh.as_pointer()
+        if pointer not in cache:
+            cache[pointer] = _mesh_digest(mesh)
+        place = np.array(instance.matrix_world, np.float32) + np.float32(0.0)
+        parts.setdefault(owner.name_full, []).extend((cache[pointer], digest_arrays(place)))
+    return {name: digest_json(digests) for name, digests in parts.items()}

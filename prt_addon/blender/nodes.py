@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reading node trees: what a socket is fed by, and a signature that changes when anything in the tree does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator
+
+import bpy
+
+# Where a node sits and how it is labelled says nothing about light; the rest of these would recurse endlessly.
+IGNORED = {"rna_type", "location", "location_absolute", "width", "height", "label", "select", "hide", "show_options",
+           "show_preview", "show_texture", "parent", "dimensions", "color", "use_custom_color", "color_tag", "inputs",
+           "outputs", "internal_links", "warning_propagation", "bl_idname", "bl_label", "bl_description", "bl_icon",
+           "bl_static_type", "bl_width_default", "bl_width_min", "bl_width_max", "bl_height_default",
+           "bl_height_min", "bl_height_max", "is_active_output", "is_active_preview", "name", "image_user_frame"}
+PLAIN = {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"}
+
+
+def source_of(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
+    """The node that feeds an input socket, past reroutes; None where nothing does.
+
+    A muted link counts as none, as in Cycles.
+    """
+    while socket.is_linked:
+        link = socket.links[0]
+        if link.is_muted or not link.is_valid:
+            return None
+        if link.from_node.bl_idname != "NodeReroute":
+            return link.from_node
+        socket = link.from_node.inputs[0]
+    return None
+
+
+def constant_of(socket: bpy.types.NodeSocket) -> tuple[float, ...] | float | None:
+    """The value of a socket that is unlinked or fed by a plain Colour or Value node; None where it varies."""
+    node = source_of(socket)
+    if node is None:
+        value = socket.default_value
+    elif node.mute:
+        return None
+    elif node.bl_idname in {"ShaderNodeRGB", "ShaderNodeValue"}:
+        same_kind = (node.bl_idname == "ShaderNodeRGB") == (socket.type == "RGBA")
+        if not same_kind:
+            return None
+        value = node.outputs[0].default_value
+    else:
+        return None
+    return float(value) if isinstance(value, (float, int)) else tuple(float(v) for v in value)
+
+
+def walk(tree: bpy.types.NodeTree, seen: set[int] | None = None) -> Iterator[bpy.types.NodeTree]:
+    """The tree and every group nested in it, each once."""
+    seen = set() if seen is None else seen
+    if tree.as_pointer() in seen:
+        return
+    seen.add(tree.as_pointer())
+    yield tree
+    for node in tree.nodes:
+        if isinstance(getattr(node, "node_tree", None), bpy.types.NodeTree):
+            yield from walk(node.node_tree, seen)
+
+
+def copy_groups(tree: bpy.types.NodeTree, change: Callable[[bpy.types.NodeTree], None],
+                copies: list[bpy.types.NodeTree]) -> None:
+    """Apply `change` to a tree of ours and to own copies of all groups nested in it; `copies` collects the copies."""
+    change(tree)
+    for node in tree.nodes:
+        if isinstance(getattr(node, "node_tree", None), bpy.types.NodeTree):
+            node.node_tree = node.node_tree.copy()
+            copies.append(node.node_tree)
+            copy_groups(node.node_tree, change, copies)
+
+
+def signature(tree: bpy.types.NodeTree) -> Hashable:
+    """Hashable value that changes when nodes, values, links, images (by file) or groups of the tree change."""
+    return tuple((tuple(_node_signature(node) for node in part.nodes),
+                  tuple((link.from_node.name, link.from_socket.identifier, link.to_node.name,
+                         link.to_socket.identifier, link.is_muted) for link in part.links)) for part in walk(tree))
+
+
+def _node_signature(node: bpy.types.Node) -> Hashable:
+    inputs = tuple(_value(s.default_value) for s in node.inputs if hasattr(s, "default_value"))
+    outputs = tuple(_value(s.default_value) for s in node.outputs if hasattr(s, "default_value"))
+    return node.bl_idname, node.name, inputs, outputs, _struct_signature(node, 0)
+
+
+def _struct_signature(struct: bpy.types.bpy_struct, depth: int) -> Hashable:
+    """Values of a struct's properties; of data-blocks only their identity, of nested settings their values."""
+    if isinstance(struct, bpy.types.Image):
+        return (struct.name_full, struct.filepath, tuple(struct.size), struct.colorspace_settings.name, struct.source,
+                struct.alpha_mode, struct.is_dirty)
+    if isinstance(struct, bpy.types.ID):
+        return struct.name_full
+    parts = []
+    for item in struct.bl_rna.properties:
+        if item.identifier in IGNORED or item.is_hidden and item.type not in PLAIN:
+            continue
+        value = getattr(struct, item.identifier)
+        if item.type in PLAIN:
+            parts.append((item.identifier, _value(value)))
+        elif item.type == "POINTER" and value is not None and depth < 3:
+            parts.append((item.identifier, _struct_signature(value, depth + 1)))
+        elif item.type == "COLLECTION" and depth < 3:
+            parts.append((item.identifier, tuple(_struct_signature(v, depth + 1) for v in value)))
+    return tuple(parts)
+
+
+def _value(value: object) -> Hashable:
+    """A property's value as something hashable with a stable text."""
+    if isinstance(value, bpy.types.bpy_struct):
+        return value.name_full if isinstance(value, bpy.types.ID) else type(value).__name__
+    if isinstance(value, (set, frozenset)):
+        return tuple(sorted(value))
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    return tuple(_value(v) for v in value)

@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked transfer in the .blend file, as design/contract.md promises it: attributes and custom properties of a Mesh.
+
+The data sits on the object's own mesh where its vertices are the receivers, else on a receiver mesh `PRT <object>`: a
+hidden child of the object. The object points to that mesh, so that appending or linking the object brings the data
+along and renaming anything breaks nothing. Beyond the contract: `prt_albedo` (FLOAT_COLOR) and `prt_normal`
+(FLOAT_VECTOR, in the object's space), both POINT.
+"""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import StorageError
+from ..storage import container
+from ..storage.container import BakedTransfer
+from .fingerprint import fingerprint, geometry_digest, material_digest, used_materials
+from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
+
+NORMAL_ATTRIBUTE = "prt_normal"
+RECEIVER_PROPERTY = "prt_receiver"
+RECEIVER_NAME = "PRT {}"
+MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
+OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE)
+
+
+def write_baked(scene_object: bpy.types.Object, baked: BakedTransfer, digests: dict[str, str | None] | None = None,
+                surroundings: dict[str, str] | None = None) -> bpy.types.Mesh:
+    """Store a complete bake for an object, in place of its previous one; returns the Mesh that carries it.
+
+    digests: `fingerprint` of the object when it was read (None: it is as it was read, take it now). surroundings: as
+    `fingerprint.surroundings` gave it then; with it, `stale` also tells when something else moved. Raises StorageError
+    where Blender can't store data for this object; its previous bake then stays.
+    """
+    if scene_object.library is not None or scene_object.override_library is not None:
+        raise StorageError(scene_object.name, "it is linked from another file", "Make it local, or bake it in that file")
+    matrix = _bake_matrix(baked, scene_object)
+    if is_flattened(matrix):
+        raise StorageError(scene_object.name, "its scale is zero along an axis", "Give it a scale and bake it again")
+    on_source = _fits_source(scene_object, baked)
+    _check_shapes(scene_object.name, baked)
+    header = _header(scene_object, baked, on_source, matrix, digests, surroundings)
+    mesh = scene_object.data if on_source else _new_receiver_mesh(scene_object, baked, matrix)
+    try:
+        _fill(mesh, baked, header, matrix)
+    except BaseException:
+        if not on_source:
+            bpy.data.meshes.remove(mesh)
+        raise
+    # Only now that the new bake is complete does the old one go.
+    previous = scene_object.get(RECEIVER_PROPERTY)
+    if on_source:
+        _drop_receiver(scene_object, previous)
+    else:
+        if isinstance(scene_object.data, bpy.types.Mesh) and scene_object.data.users == 1:
+            _clear_mesh(scene_object.data)
+        _attach_receiver(scene_object, mesh, previous)
+    mesh.update_tag()
+    return mesh
+
+
+def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
+    """The bake stored for an object (or on a receiver object itself); None without one.
+
+    Positions and normals are world space at bake time; `transform_since_bake` takes them to now. Raises StorageError
+    where the data is broken, does not fit its mesh any more, or has a newer schema.
+    """
+    mesh = baked_mesh(scene_object)
+    if mesh is None:
+        return None
+    if mesh.is_editmode:
+        raise StorageError(scene_object.name, "its baked data can't be read in edit mode", "Leave edit mode")
+    header = container.parse_header(mesh[container.HEADER_PROPERTY], scene_object.name)
+    cluster = _read_attribute(mesh, container.CLUSTER_ATTRIBUTE, scene_object.name)
+    vectors = header["shape"][1] - 1
+    weights = [_read_attribute(mesh, f"{container.WEIGHTS_ATTRIBUTE}{k}", scene_object.name)
+               for k in range(-(-vectors // 4))]
+    albedo = _read_attribute(mesh, container.ALBEDO_ATTRIBUTE, scene_object.name)[:, :3]
+    normals = _read_attribute(mesh, NORMAL_ATTRIBUTE, scene_object.name)
+    bases = mesh.get(container.BASES_PROPERTY)
+    if bases is None:
+        raise StorageError(scene_object.name, "its baked data has no bases", container.REBAKE)
+    matrix = _header_matrix(header, scene_object.name)
+    arrays = read_mesh(mesh)
+    world = transform_rows(arrays.positions, matrix[:3, :3]) + matrix[:3, 3]
+    triangles = arrays.triangles[:, [0, 2, 1]] if _mirrors(matrix) else arrays.triangles
+    geometry = (albedo, world, _unit_rows(transform_rows(normals, normal_matrix(matrix))), triangles)
+    return container.unpack(header, cluster, weights, np.array(bases, np.float32), geometry, scene_object.name)
+
+
+def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
+    """The Mesh that carries an object's bake: its receiver's, else its own; None without a bake. Cheap."""
+    receiver = scene_object.get(RECEIVER_PROPERTY)
+    if isinstance(receiver, bpy.types.Mesh) and container.HEADER_PROPERTY in receiver:
+        return receiver
+    mesh = scene_object.data
+    return mesh if isinstance(mesh, bpy.types.Mesh) and container.HEADER_PROPERTY in mesh else None
+
+
+def is_receiver(scene_object: bpy.types.Object) -> bool:
+    """Whether this object only carries another one's bake."""
+    parent = scene_object.parent
+    return parent is not None and scene_object.data is not None and parent.get(RECEIVER_PROPERTY) == scene_object.data
+
+
+def baked_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The scene's objects that have a bake, without the receivers that carry it."""
+    return [o for o in scene.objects if baked_mesh(o) is not None and not is_receiver(o)]
+
+
+def clear_baked(scene_object: bpy.types.Object) -> bool:
+    """Remove an object's bake and its receiver; True if there was one. Other objects' bakes stay."""
+    found = baked_mesh(scene_object) is not None
+    _drop_receiver(scene_object, scene_object.get(RECEIVER_PROPERTY))
+    if isinstance(scene_object.data, bpy.types.Mesh) and container.HEADER_PROPERTY in scene_object.data:
+        _clear_mesh(scene_object.data)
+    return found
+
+
+def stored_header(scene_object: bpy.types.Object) -> dict | None:
+    """The header of an object's bake without reading the rest; None without a bake. Raises StorageError if broken."""
+    mesh = baked_mesh(scene_object)
+    return None if mesh is None else container.parse_header(mesh[container.HEADER_PROPERTY], scene_object.name)
+
+
+def transform_since_bake(scene_object: bpy.types.Object, header: dict) -> NDArray[np.float64]:
+    """(4, 4) from world space at bake time to world space now: identity where the object was not moved."""
+    then = _header_matrix(header, scene_object.name)
+    now = np.array(scene_object.matrix_world, np.float64)
+    return np.eye(4) if _same_place(now, then) else now @ np.linalg.inv(then)  # small
+
+
+def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
+          surroundings: dict[str, str] | None = None) -> str | None:
+    """Why an object's bake no longer fits the scene, as a clause for the user; None while it does or without a bake.
+
+    surroundings: of now, from `fingerprint.surroundings`, if what else moved shall count too. Raises StorageError where
+    the header can't be read.
+    """
+    header = stored_header(scene_object)
+    if header is None:
+        return None
+    digests = header.get("digests", {})
+    geometry = geometry_digest(scene_object, depsgraph)
+    if geometry is not None and digests.get("geometry") != geometry:
+        return "its mesh or modifiers changed since the bake"
+    if not _same_place(np.array(scene_object.matrix_world, np.float64), _header_matrix(header, scene_object.name)):
+        return "it was moved, turned or scaled since the bake"
+    if digests.get("materials") != material_digest(used_materials(scene_object)):
+        return "its materials changed since the bake"
+    return _changed_surroundings(digests.get("surroundings"), surroundings, scene_object.name_full)
+
+
+def _changed_surroundings(then: dict[str, str] | None, now: dict[str, str] | None, own_name: str) -> str | None:
+    if then is None or now is None:
+        return None
+    # Compared by content: a renamed object casts the same shadow.
+    gone = [name for name, digest in then.items() if digest not in now.values() and name != own_name]
+    new = [name for name, digest in now.items() if digest not in then.values() and name != own_name]
+    if gone or new:
+        return f"{(new or gone)[0]}, which can shadow or light it, changed since the bake"
+    return None
+
+
+def _same_place(now: NDArray[np.float64], then: NDArray[np.float64]) -> bool:
+    return bool(np.abs(now - then).max() <= MATRIX_TOLERANCE * max(np.abs(then[:3]).max(), 1e-30))
+
+
+def _bake_matrix(baked: BakedTransfer, scene_object: bpy.types.Object) -> NDArray[np.float64]:
+    """The object's transform when it was baked, from the header, else as it is now."""
+    if "matrix" in baked.header:
+        return _header_matrix(baked.header, scene_object.name)
+    return np.array(scene_object.matrix_world, np.float64)
+
+
+def _header_matrix(header: dict, subject: str) -> NDArray[np.float64]:
+    """(4, 4) from the header's 16 numbers, row by row."""
+    numbers = np.asarray(header.get("matrix", ()), np.float64).ravel()
+    if numbers.size != 16 or not np.isfinite(numbers).all():
+        raise StorageError(subject, "the header of its baked data states no valid transform", container.REBAKE)
+    return numbers.reshape(4, 4)
+
+
+def _mirrors(matrix: NDArray[np.float64]) -> bool:
+    return bool(np.linalg.det(matrix[:3, :3] / np.abs(matrix[:3, :3]).max()) < 0.0)  # small
+
+
+def _unit_rows(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
+    length = np.sqrt(np.sum(vectors ** 2, axis=1, keepdims=True))
+    return (vectors / np.maximum(length, np.finfo(np.float64).tiny)).astype(np.float32)
+
+
+def _fits_source(scene_object: bpy.types.Object, baked: BakedTransfer) -> bool:
+    """Whether the object's own mesh can carry the bake: its vertices are the receivers and nobody else uses it."""
+    mesh = scene_object.data
+    return (bool(baked.header.get("source", {}).get("on_source_mesh"))
+            and isinstance(mesh, bpy.types.Mesh) and mesh.library is None and mesh.users == 1
+            and mesh.shape_keys is None and not mesh.is_editmode and not scene_object.modifiers and not scene_object.is_instancer
+            and len(mesh.vertices) == len(baked.cluster))
+
+
+def _check_shapes(name: str, baked: BakedTransfer) -> None:
+    """Refuse a container that could not be read back, before anything is replaced."""
+    clusters, representatives, rows, columns, channels = baked.bases.shape
+    header = {**baked.header, "shape": [clusters, representatives, rows, columns, channels]}
+    container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
+                     (baked.albedo, baked.positions, baked.normals, baked.triangles), name)
+    if baked.weights.shape[1] != representatives - 1:
+        raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
+
+
+def _header(scene_object: bpy.types.Object, baked: BakedTransfer, on_source: bool, matrix: NDArray[np.float64],
+            digests: dict[str, str | None] | None, surroundings: dict[str, str] | None) -> dict:
+    """The stored header: the bake's, with where it sits, what it was baked from, and the digests of that."""
+    own = fingerprint(scene_object, bpy.context.evaluated_depsgraph_get()) if digests is None else digests
+    stored = {**baked.header.get("digests", {}), **own}
+    if surroundings is not None:
+        stored["surroundings"] = surroundings
+    source = {"object": scene_object.name, "mesh": getattr(scene_object.data, "name", None),
+              "on_source_mesh": on_source}
+    return {**baked.header, "shape": list(baked.bases.shape), "source": source, "digests": stored,
+            "matrix": [float(v) for v in matrix.ravel()]}
+
+
+def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDArray[np.float64]) -> None:
+    """Attributes and properties of a bake onto a mesh that has its points, in place of any previous ones."""
+    _clear_mesh(mesh)
+    local_normals = _unit_rows(transform_rows(baked.normals, normal_matrix(np.linalg.inv(matrix))))  # small
+    opaque = np.concatenate([baked.albedo, np.ones((len(baked.albedo), 1), np.float32)], axis=1)
+    _write_attribute(mesh, container.CLUSTER_ATTRIBUTE, "INT", baked.cluster)
+    for index, packed in enumerate(container.pack_weights(baked.weights)):
+        _write_attribute(mesh, f"{container.WEIGHTS_ATTRIBUTE}{index}", "FLOAT4", packed)
+    _write_attribute(mesh, NORMAL_ATTRIBUTE, "FLOAT_VECTOR", local_normals)
+    _write_attribute(mesh, container.ALBEDO_ATTRIBUTE, "FLOAT_COLOR", opaque)
+    mesh[container.BASES_PROPERTY] = np.ascontiguousarray(baked.bases, np.float32).ravel()
+    mesh[container.HEADER_PROPERTY] = json.dumps(header)
+
+
+MEMBERS = {"INT": ("value", 1, np.int32), "FLOAT4": ("vector", 4, np.float32),
+           "FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT_COLOR": ("color", 4, np.float32)}
+
+
+def _write_attribute(mesh: bpy.types.Mesh, name: str, kind: str, values: NDArray) -> None:
+    member, _, dtype = MEMBERS[kind]
+    attribute = mesh.attributes.new(name, kind, "POINT")
+    if attribute.name != name:
+        taken = attribute.name
+        mesh.attributes.remove(mesh.attributes[taken])
+        raise StorageError(mesh.name, f"an attribute named {name} is in the way", "Rename or remove it")
+    attribute.data.foreach_set(member, np.ascontiguousarray(values, dtype).ravel())
+
+
+def _read_attribute(mesh: bpy.types.Mesh, name: str, subject: str) -> NDArray:
+    attribute = mesh.attributes.get(name)
+    if attribute is None or attribute.domain != "POINT" or attribute.data_type not in MEMBERS:
+        raise StorageError(subject, f"the attribute {name} of its baked data is missing or was converted",
+                           container.REBAKE)
+    member, width, dtype = MEMBERS[attribute.data_type]
+    values = np.empty(len(attribute.data) * width, dtype)
+    attribute.data.foreach_get(member, values)
+    return values if width == 1 else values.reshape(-1, width)
+
+
+def _clear_mesh(mesh: bpy.types.Mesh) -> None:
+    """Remove everything of ours from a mesh, and put back which colour the user had chosen."""
+    active, default = mesh.color_attributes.active_color_name, mesh.color_attributes.default_color_name
+    for name in [a.name for a in mesh.attributes if a.name.startswith(OURS)]:
+        mesh.attributes.remove(mesh.attributes[name])
+    for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY):
+        if key in mesh:
+            del mesh[key]
+    if active in mesh.color_attributes:
+        mesh.color_attributes.active_color_name = active
+    if default in mesh.color_attributes:
+        mesh.color_attributes.default_color_name = default
+
+
+def _new_receiver_mesh(scene_object: bpy.types.Object, baked: BakedTransfer,
+                       matrix: NDArray[np.float64]) -> bpy.types.Mesh:
+    """The receivers and their triangles as a mesh in the object's space."""
+    inverse = np.linalg.inv(matrix)  # small
+    local = (transform_rows(baked.positions, inverse[:3, :3]) + inverse[:3, 3]).astype(np.float32)
+    triangles = baked.triangles[:, [0, 2, 1]] if _mirrors(matrix) else baked.triangles
+    mesh = bpy.data.meshes.new(RECEIVER_NAME.format(scene_object.name))
+    mesh.vertices.add(len(local))
+    mesh.vertices.foreach_set("co", local.ravel())
+    mesh.loops.add(3 * len(triangles))
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(triangles, np.int32).ravel())
+    mesh.polygons.add(len(triangles))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(triangles), 3, dtype=np.int32))
+    mesh.update(calc_edges=True)
+    return mesh
+
+
+def _receiver_object(scene_object: bpy.types.Object, mesh: object) -> bpy.types.Object | None:
+    """The child of an object that carries the mesh."""
+    if not isinstance(mesh, bpy.types.Mesh):
+        return None
+    return next((child for child in scene_object.children if child.data == mesh), None)
+
+
+def _attach_receiver(scene_object: bpy.types.Object, mesh: bpy.types.Mesh, previous: object) -> None:
+    """Make the mesh the object's receiver: a child that neither renders nor shows, in the object's collections."""
+    name = RECEIVER_NAME.format(scene_object.name)
+    carrier = _receiver_object(scene_object, previous)
+    if carrier is None:
+        carrier = bpy.data.objects.new(name, mesh)
+        carrier.parent = scene_object
+        for collection in scene_object.users_collection:
+            collection.objects.link(carrier)
+    else:
+        carrier.data = mesh
+    carrier.hide_render = carrier.hide_viewport = carrier.hide_select = True
+    scene_object[RECEIVER_PROPERTY] = mesh
+    _remove_if_unused(previous, mesh)
+    mesh.name = carrier.name = name
+
+
+def _drop_receiver(scene_object: bpy.types.Object, mesh: object) -> None:
+    carrier = _receiver_object(scene_object, mesh)
+    if RECEIVER_PROPERTY in scene_object:
+        del scene_object[RECEIVER_PROPERTY]
+    if carrier is not None and carrier.library is None:
+        bpy.data.objects.remove(carrier)
+    _remove_if_unused(mesh, None)
+
+
+def _remove_if_unused(mesh: object, keep: bpy.types.Mesh | None) -> None:
+    """Remove a receiver mesh that no object uses or points to any more (a copy of the object may still)."""
+    if isinstance(mesh, bpy.types.Mesh) and mesh != keep and mesh.library is None and mesh.users == 0:
+        bpy.data.meshes.remove(mesh)

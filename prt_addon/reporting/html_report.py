@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report as one self-contained page that explains itself: no script, no address, plots as inline SVG.
+
+It needs the promised keys of a report (report_file) and shows the optional ones (warnings, hints, objects of clusters,
+bounces, what was resumed) where they are there. Everything that came from the scene is escaped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from . import svg_plots, wording
+from .svg_plots import percent
+from .wording import count, duration, memory, number, plural
+
+Report = dict[str, Any]
+MOST_CURVES = len(svg_plots.SERIES_CLASSES)
+
+
+def render(report: Report) -> str:
+    """The page of a valid report (see `report_file.problem_of`)."""
+    style = Path(__file__).with_name("report.css").read_text("utf-8")
+    sections = (_attention, _times, _errors, _left_out, _compression, _bounces, _checks, _settings, _glossary)
+    body = "\n".join(section(report) for section in sections)
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>Bake report: {escape(_objects_text(report))}</title>\n<style>\n{style}</style></head>\n<body><main>\n"
+        f"{_head(report)}\n{body}\n</main></body></html>\n"
+    )
+
+
+def _objects(report: Report) -> list[str]:
+    return [str(o if not isinstance(o, dict) else o.get("name", "")) for o in report["scene"]["objects"]]
+
+
+def _objects_text(report: Report) -> str:
+    names = _objects(report)
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _section(title: str, *parts: str, style: str = "") -> str:
+    attribute = f' class="{style}"' if style else ""
+    return f"<section{attribute}><h2>{escape(title)}</h2>{''.join(parts)}</section>"
+
+
+def _table(headings: Sequence[tuple[str, bool]], rows: Iterable[Sequence[str]]) -> str:
+    """A table of cells that are HTML already. headings: (text, whether the column holds numbers)."""
+    kinds = [' class="number"' if is_number else "" for _, is_number in headings]
+    head = "".join(f"<th{kind}>{escape(text)}</th>" for kind, (text, _) in zip(kinds, headings, strict=True))
+    lines = ("".join(f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, row, strict=True)) for row in rows)
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+
+
+def _head(report: Report) -> str:
+    """One sentence that says how it went, and the main numbers."""
+    scene, total = report["scene"], report["errors"].get("total")
+    objects = plural(len(scene["objects"]), "object", "objects")
+    lead = f"Baked {objects} with {plural(scene['receivers'], 'point', 'points')} in {duration(report['seconds'])}."
+    if total and total["relative_rms"] is not None:
+        lead += f" The picture differs from a full light simulation by {percent(total['relative_rms'])}."
+    elif not report["errors"]:
+        lead += " The error was not measured (error_receivers is 0)."
+    cards = (
+        (duration(report["seconds"]), "for the whole bake"),
+        (count(report["rays"]), f"rays, {count(report['rays_per_second'])} per second"),
+        (memory(report["peak_bytes"]), "memory at the most"),
+        (count(scene["triangles"]), "triangles cast shadows and bounce light"),
+    )
+    boxes = "".join(f'<div class="card"><b>{escape(value)}</b><span>{escape(text)}</span></div>'
+                    for value, text in cards)
+    return (f"<h1>Bake report: {escape(_objects_text(report))}</h1>"
+            f'<p class="lead">{escape(lead)}</p><div class="cards">{boxes}</div>')
+
+
+def _failed(report: Report) -> list[dict[str, Any]]:
+    return [entry for entry in report["stability"] if entry["verdict"] != "ok"]
+
+
+def _attention(report: Report) -> str:
+    """Warnings, failed checks and hints; nothing where there are none."""
+    lines = [f"{entry['check']}: {number(entry['value'])} (limit {number(entry['limit'])}). {entry['verdict']}"
+             for entry in _failed(report)]
+    lines += [str(warning) for warning in report["scene"].get("warnings", [])]
+    hints = [str(hint) for hint in report.get("hints", [])]
+    if not lines and not hints:
+        return ""
+    title = "Worth a look" if lines else "Hints"
+    items = "".join(f"<li>{escape(line)}</li>" for line in [*lines, *hints])
+    return _section(title, f"<ul>{items}</ul>", style="attention" if lines else "")
+
+
+def _times(report: Report) -> str:
+    """Stage bars, and what each stage does."""
+    rows, words = [], []
+    for stage in report["stages"]:
+        name, meaning = wording.STAGES.get(stage["name"], (stage["name"], ""))
+        note = duration(stage["seconds"])
+        if stage["rays"]:
+            note += f", {count(stage['rays'])} rays"
+        rows.append((name, stage["seconds"] or 0.0, note))
+        if meaning:
+            words.append(f"<dt>{escape(name)}</dt><dd>{escape(meaning)}; up to {memory(stage['peak_bytes'])}</dd>")
+    resumed = report.get("resumed") or []
+    note = ""
+    if resumed:
+        names = ", ".join(wording.STAGES.get(name, (name,))[0].lower() for name in resumed)
+        note = f'<p class="why">Taken over from an interrupted bake, without their time: {escape(names)}.</p>'
+    plot = svg_plots.bars(rows, "Seconds of each stage")
+    return _section("Where the time went", plot, f"<dl>{''.join(words)}</dl>", note)
+
+
+def _errors(report: Report) -> str:
+    """The error budget: a plot with intervals and what to do about each part."""
+    rows, words = [], []
+    for name, (label, meaning, remedy) in wording.ERRORS.items():
+        entry = report["errors"].get(name)
+        if entry is None or entry["relative_rms"] is None:
+            continue
+        low, high = (entry["relative_rms"] if end is None else end for end in entry["interval"])
+        rows.append(svg_plots.Interval(label, entry["relative_rms"], low, high))
+        advice = f" Smaller with {remedy}." if remedy else ""
+        words.append(f"<dt>{escape(label)}</dt><dd>{escape(meaning)}.{escape(advice)}</dd>")
+    if not rows:
+        return _section("How right is the picture?", "<p>Not measured: the bake was asked for no reference rays.</p>")
+    largest = report["errors"]["total"]
+    measured = (f"Measured at {plural(largest['receivers'], 'random point', 'random points')} with "
+                f"{count(largest['reference_rays'])} independent rays. Dot: measured value; line: its 95 % interval.")
+    metric = report.get("error_metric")
+    metric_line = f'<p class="why">Each number: {escape(str(metric))}.</p>' if metric else ""
+    plot = svg_plots.intervals(rows, wording.ZONES, "Relative error by cause with 95 % intervals")
+    return _section("How right is the picture?", f'<p class="why">{escape(measured)}</p>', plot,
+                    f"<dl>{''.join(words)}</dl>", metric_line)
+
+
+def _left_out(report: Report) -> str:
+    rows = [[escape(str(entry[key])) for key in ("what", "why", "saved")] for entry in report["left_out"]]
+    if not rows:
+        return _section("What was left out", "<p>Nothing: this scene needs every step of the bake.</p>")
+    intro = '<p class="why">Work this scene does not need. Leaving it out does not change the picture.</p>'
+    return _section("What was left out", intro, _table((("What", False), ("Why", False), ("Saved", False)), rows))
+
+
+def _compression(report: Report) -> str:
+    """Clusters in numbers, and each object's error while its encoder ran."""
+    clusters = report["clusters"]
+    objects: dict[str, dict[str, Any]] = clusters.get("objects") or {}
+    intro = ('<p class="why">The points of an object are grouped into clusters; each point then needs only a few '
+             f"numbers. {plural(clusters['count'], 'cluster', 'clusters')} with {number(clusters['vectors_mean'])} "
+             f"vectors on average, total squared error {number(clusters['squared_error'])}, "
+             f"overdraw {number(clusters['overdraw'])}.</p>")
+    rows = [[escape(name), count(o.get("receivers")), count(o.get("count")), number(o.get("vectors_mean")),
+             "unknown" if o.get("relative_error") is None else percent(o["relative_error"]), number(o.get("overdraw"))]
+            for name, o in objects.items()]
+    numbers = [(name, True) for name in ("Points", "Clusters", "Vectors", "Error", "Overdraw")]
+    table = _table([("Object", False), *numbers], rows) if rows else ""
+    # The largest objects tell the most; more lines than colours could not be told apart.
+    largest = sorted(objects, key=lambda name: -int(objects[name].get("receivers") or 0))[:MOST_CURVES]
+    plot = svg_plots.curves([svg_plots.Curve(_short(name), _history(objects[name])) for name in largest],
+                            "seconds of compressing the object", "relative error of the compressed data",
+                            "Error of the compression over time")
+    heading = "<h3>Error while compressing</h3>" if plot else ""
+    return _section("Compression", intro, table, heading, plot)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 20 else f"{name[:19]}\u2026"
+
+
+def _history(encoded: dict[str, Any]) -> list[tuple[float, float]]:
+    """(seconds, relative error): the recorded squared errors, scaled so that the last is the final relative error."""
+    entries = [entry for entry in encoded.get("history") or [] if None not in entry]
+    final = entries[-1][2] if entries else 0.0
+    relative = encoded.get("relative_error") or 0.0
+    if final <= 0.0 or relative <= 0.0:
+        return []
+    return [(float(at), relative * math.sqrt(max(squared, 0.0) / final)) for at, _, squared in entries]
+
+
+def _bounces(report: Report) -> str:
+    """How the bounced light died away, where the report tells."""
+    bounces = report.get("bounces")
+    if not bounces:
+        return ""
+    left = [entry for entry in bounces.get("history") or [] if entry is not None]
+    curve = svg_plots.Curve("light left", list(enumerate(left, 1)))
+    plot = svg_plots.curves([curve], "step", "share of the light left", "Light left after each bounce")
+    if not plot:
+        return ""
+    intro = ('<p class="why">Each step passes the light on from surface to surface once. The bake stops when too '
+             "little is left to matter.</p>")
+    return _section("Bounced light", intro, plot)
+
+
+def _checks(report: Report) -> str:
+    """The stability table."""
+    if not report["stability"]:
+        return ""
+    rows = []
+    for entry in report["stability"]:
+        style = "good" if entry["verdict"] == "ok" else "warn"
+        rows.append([escape(entry["check"]), number(entry["value"]), number(entry["limit"]),
+                     f'<span class="{style}">{escape(entry["verdict"])}</span>'])
+    failed = len(_failed(report))
+    title = "Checks: all fine" if not failed else f"Checks: {failed} of {len(rows)} need a look"
+    intro = '<p class="why">Things that hold for every physically possible result, whatever the scene.</p>'
+    heads = (("Check", False), ("Value", True), ("Limit", True), ("Verdict", False))
+    return _section(title, intro, _table(heads, rows))
+
+
+def _settings(report: Report) -> str:
+    rows = [[escape(name.replace("_", " ")), escape(number(value))] for name, value in report["settings"].items()]
+    table = _table((("Setting", False), ("Value", True)), rows)
+    return f"<section><details><summary>Settings of this bake</summary>{table}</details></section>"
+
+
+def _glossary(_report: Report) -> str:
+    words = "".join(f"<dt>{escape(name)}</dt><dd>{escape(meaning)}</dd>" for name, meaning in wording.GLOSSARY)
+    return f"<section><details><summary>What do the words mean?</summary><dl>{words}</dl></details></section>"

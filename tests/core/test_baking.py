@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The recipe end to end: error budget, left-out work, resuming, cancelling, stability."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.core.shapes import box, drain, plane, sphere
+
+from prt_addon.baking.job import job_summary, read_result, run_job, write_job
+from prt_addon.baking.recipe import bake, exhaust
+from prt_addon.baking.settings import BakeSettings, make_settings
+from prt_addon.errors import BadArguments
+from prt_addon.lighting.environment import project
+from prt_addon.lighting.reference_light import ReferenceLight, averaged, stand_in_light
+from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.tracing.tracer import Tracer
+from prt_addon.transport.path_reference import DistantSuns, reference_radiance
+from prt_addon.transport.receiver_set import ReceiverSet
+
+SMALL = BakeSettings(order=3, directions=512, gather_directions=128, clusters=16, vectors=4, encoder="static", spacing=0.05,
+                     compression_error=1e-2, error_receivers=24, error_paths=2048, threads=1)
+NO_SUNS = DistantSuns(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+def still_life(spacing=0.05):
+    meshes = [plane(size=4.0, albedo=(0.8, 0.8, 0.8)), sphere(centre=(0, 0, 0.9), radius=0.8, albedo=(0.8, 0.2, 0.1))]
+    return SceneMesh.assemble(meshes, spacing)
+
+
+def white(directions):
+    return np.ones((len(directions), 1, 3))
+
+
+def test_reference_is_one_over_one_minus_albedo_in_a_furnace_with_a_sky():
+    # A convex body in a unit sky: exactly 1 without bounces. A plate over a mirror plate keeps some of it.
+    scene = SceneMesh.assemble([sphere(subdivisions=2)])
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    receivers = ReceiverSet.of_keys(scene, tracer, np.arange(20))
+    radiance = drain(reference_radiance(tracer, scene, receivers, scene.albedo, white, NO_SUNS, 512, -1, 3))
+    assert np.abs(radiance - 1.0).max() < 1e-12
+
+
+def test_reference_of_white_surfaces_returns_all_light():
+    # Albedo 1 everywhere and no absorption: every path ends in the sky, radiance is 1 wherever it was emitted.
+    scene = SceneMesh.assemble([plane(size=4.0, cells=2), sphere(centre=(0, 0, 0.9), radius=0.8, subdivisions=2)])
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    receivers = ReceiverSet.of_keys(scene, tracer, np.arange(9))
+    radiance = drain(reference_radiance(tracer, scene, receivers, np.ones_like(scene.albedo), white, NO_SUNS, 512, -1, 3))
+    assert np.abs(radiance - 1.0).max() < 1e-9
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.01, 1.0])
+def test_reference_sun_on_an_open_plane(angle):
+    scene = SceneMesh.assemble([plane()])
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    receivers = ReceiverSet.of_keys(scene, tracer, np.arange(4))
+    direction = np.array([[0.6, 0.0, 0.8]])
+    suns = DistantSuns(direction, np.array([[5.0, 2.0, 1.0]]), np.array([angle]))
+    radiance = drain(reference_radiance(tracer, scene, receivers, scene.albedo, lambda d: np.zeros((len(d), 1, 3)), suns,
+                                        4096, 0, 3))
+    # Irradiance 5 on a facing plane, cosine 0.8, Lambertian: E cos / pi (a disc above the horizon has the same mean).
+    assert np.abs(radiance - 0.8 / np.pi * np.array([5.0, 2.0, 1.0])).max() < 0.02
+
+
+def test_budget_of_a_standard_bake_is_small_and_in_order():
+    result = exhaust(bake(still_life(), SMALL))
+    errors = result.report["errors"]
+    assert set(errors) == {"sampling", "basis", "compression", "total"}
+    for entry in errors.values():
+        low, high = entry["interval"]
+        assert low <= entry["relative_rms"] <= high or entry["relative_rms"] == 0.0
+        assert entry["receivers"] == 24
+    assert errors["total"]["relative_rms"] < 0.06
+    assert errors["compression"]["relative_rms"] < 0.02
+
+
+def test_sampling_error_falls_with_directions():
+    coarse, fine = (exhaust(bake(still_life(), BakeSettings(
+        order=3, directions=d, gather_directions=g, clusters=16, vectors=4, encoder="static", error_receivers=48,
+        error_paths=16384, threads=1))).report["errors"]["sampling"]["relative_rms"] for d, g in ((48, 16), (2048, 512)))
+    assert fine < 0.5 * coarse
+
+
+def test_convex_mesh_needs_no_ray():
+    settings = make_settings("draft", {"error_receivers": "0"})
+    result = exhaust(bake(SceneMesh.assemble([sphere()]), settings))
+    assert result.report["rays"] == 0
+    assert any("convex" in item["why"] for item in result.report["left_out"])
+    assert {s["name"] for s in result.report["stages"]} == {"prepare", "direct", "encode"}
+
+
+def test_grey_scene_has_one_channel_and_coloured_three():
+    grey = exhaust(bake(SceneMesh.assemble([plane(size=4.0, cells=8), box(low=(-1, -1, 0.5), high=(1, 1, 1))]), SMALL))
+    assert {o.bases.shape[4] for o in grey.objects.values()} == {1}
+    assert {o.bases.shape[4] for o in exhaust(bake(still_life(), SMALL)).objects.values()} == {3}
+
+
+def test_closed_room_at_099_converges_and_says_how():
+    room = SceneMesh.assemble([box(inward=True, albedo=(0.99,) * 3),
+                               box("thing", (0.4, 0.4, 0.4), (0.6, 0.6, 0.6), albedo=(0.99,) * 3)], 0.2)
+    report = exhaust(bake(room, SMALL)).report
+    assert [s["verdict"] for s in report["stability"] if s["check"].startswith("energy left")] == ["ok"]
+    assert all(np.isfinite(s["value"]) for s in report["stability"])
+
+
+def test_inward_normals_of_an_open_mesh_are_pointed_out():
+    # A black hollow ball with one face missing whose normals point inside: a few receivers see a speck of sky.
+    mesh = sphere(subdivisions=3, inward=True, albedo=(0, 0, 0))
+    ball = replace(mesh, triangles=mesh.triangles[1:], corner_normals=mesh.corner_normals[1:],
+                   corner_albedo=mesh.corner_albedo[1:])
+    report = exhaust(bake(SceneMesh.assemble([ball]), SMALL)).report
+    assert any("point inwards" in s["verdict"] for s in report["stability"])
+
+
+def test_killed_bake_resumes_to_the_same_result(tmp_path):
+    scene = still_life()
+    job = write_job(tmp_path, scene, SMALL, stand_in_light())
+    steps = run_job(job)
+    for progress in steps:
+        if progress.stage == "interreflection":
+            break
+    steps.close()
+    assert job_summary(job) == {"finished": ["direct", "gather"], "complete": False}
+    assert write_job(tmp_path, scene, SMALL, stand_in_light()) == job
+    drain(run_job(job))
+    result = read_result(job)
+    assert result.report["resumed"] == ["gather", "direct"]
+    fresh = exhaust(bake(scene, SMALL, light=stand_in_light()))
+    for name, container in fresh.objects.items():
+        for part in ("cluster", "weights", "bases", "positions", "triangles"):
+            assert np.array_equal(getattr(container, part), getattr(result.objects[name], part)), (name, part)
+    assert not list(job.glob("*.part"))
+
+
+def test_other_settings_are_another_job(tmp_path):
+    scene = still_life()
+    other = make_settings("draft", {"order": "2"})
+    assert write_job(tmp_path, scene, SMALL) != write_job(tmp_path, scene, other)
+    assert write_job(tmp_path, scene, SMALL) != write_job(tmp_path, still_life(0.04), SMALL)
+
+
+def test_progress_never_falls():
+    fractions = [p.fraction for p in bake(still_life(), SMALL)]
+    assert all(b >= a - 1e-12 for a, b in zip(fractions, fractions[1:], strict=False))
+    assert 0.0 <= fractions[0] and 0.9 < fractions[-1] <= 1.0
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("order", "11"), ("order", "x"), ("clusters", "0"), ("encoder", "zip"), ("nonsense", "1"), ("spacing", "nan"),
+    ("fit_order_to_light", "maybe")])
+def test_bad_settings_are_refused_by_name(name, value):
+    with pytest.raises(BadArguments, match=name):
+        make_settings("standard", {name: value})
+
+
+def test_reference_light_keeps_all_light_of_a_one_pixel_sun():
+    image = np.zeros((512, 1024, 3), np.float32)
+    image[100, 300] = 1e6
+    light = ReferenceLight.of(image, None, [], "one pixel")
+    assert light.image.shape == (64, 128, 3)
+    assert np.allclose(light.coefficients(1), project(image, 1), rtol=1e-6)
+    assert averaged(np.ones((100, 250, 3), np.float32), 128) == pytest.approx(1.0)

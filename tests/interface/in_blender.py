@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The steps an artist takes, in a Blender with its interface: run by run.py, one step per timer call.
+
+A step is a generator function: `yield seconds` lets Blender draw and handle events for that long. Results go to
+interface.json, screenshots beside it. Blender quits by itself afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+MODULE = "bl_ext.user_default.prt"
+OUTPUT, SCENE = (Path(text) for text in sys.argv[sys.argv.index("--") + 1:][:2])
+LONGEST_FREEZE = 0.6  # seconds without a timer call while a bake runs; software drawing alone takes a third of it
+BAKE_SECONDS = 180.0
+
+Step = Generator[float]
+
+
+def window() -> bpy.types.Window:
+    return bpy.context.window_manager.windows[0]
+
+
+def area() -> bpy.types.Area:
+    return next(a for a in window().screen.areas if a.type == "VIEW_3D")
+
+
+def region(kind: str = "WINDOW") -> bpy.types.Region:
+    return next(r for r in area().regions if r.type == kind)
+
+
+def override() -> object:
+    return bpy.context.temp_override(window=window(), area=area(), region=region())
+
+
+def session() -> bpy.types.PropertyGroup:
+    return bpy.context.window_manager.prt
+
+
+def shoot(name: str) -> np.ndarray:
+    """A screenshot as (height, width, 3) in 0..255, saved as NAME.png."""
+    path = OUTPUT / f"{name}.png"
+    subprocess.run(["import", "-window", "root", str(path)], check=True, timeout=30)
+    raw = subprocess.run(["convert", str(path), "-depth", "8", "rgb:-"], check=True, capture_output=True, timeout=30)
+    return np.frombuffer(raw.stdout, np.uint8).reshape(1000, 1600, 3)
+
+
+def view(picture: np.ndarray) -> np.ndarray:
+    """The part of a screenshot that the viewport's middle fills."""
+    box = region()
+    height = picture.shape[0]
+    top, bottom = height - (box.y + box.height) + 90, height - box.y - 10
+    return picture[top:bottom, box.x + 80:box.x + box.width - 420].astype(np.float64)
+
+
+def select(*names: str) -> None:
+    for scene_object in bpy.context.scene.objects:
+        scene_object.select_set(scene_object.name in names)
+    bpy.context.view_layer.objects.active = bpy.data.objects[names[0]] if names else None
+
+
+def wait_for_bake(shot: str | None = None) -> Step:
+    """Until no bake runs; fails where Blender froze meanwhile."""
+    started = last = time.monotonic()
+    longest = 0.0
+    while session().running:
+        assert time.monotonic() - started < BAKE_SECONDS, "the bake takes too long"
+        yield 0.05
+        longest, last = max(longest, time.monotonic() - last), time.monotonic()
+        if shot and session().fraction > 0.2:
+            shoot(shot)
+            shot, last = None, time.monotonic()
+    assert longest < LONGEST_FREEZE, f"Blender froze for {longest:.2f} s during the bake"
+
+
+def invoke_bake() -> set[str]:
+    with override():
+        return bpy.ops.prt.bake("INVOKE_DEFAULT")
+
+
+def children() -> list[str]:
+    """Command lines of this process's living children."""
+    listed = subprocess.run(["ps", "-o", "args=", "--ppid", str(os.getpid())], capture_output=True, text=True)
+    return [line for line in listed.stdout.splitlines() if "worker.py" in line]
+
+
+def carrier(name: str) -> bpy.types.Mesh | None:
+    """The mesh that holds an object's bake."""
+    found = bpy.data.objects[name]
+    mesh = found.get("prt_receiver") or found.data
+    return mesh if "prt_header" in mesh else None
+
+
+def open_scene() -> Step:
+    """The panel is there, and says what can't be done yet."""
+    with override():
+        bpy.ops.wm.open_mainfile(filepath=str(SCENE), load_ui=False)
+    yield 1.0
+    space = area().spaces.active
+    space.show_region_ui, space.shading.type = True, "MATERIAL"
+    space.region_3d.view_rotation = (0.78, 0.42, 0.21, 0.41)
+    space.region_3d.view_distance, space.region_3d.view_location = 8.0, (0.0, 0.0, 0.8)
+    yield 1.5
+    region("UI").active_panel_category = "PRT"
+    yield 1.5
+    shoot("01_panel")
+    with override():
+        assert bpy.ops.prt.bake.poll()
+        assert not bpy.ops.prt.toggle_preview.poll(), "nothing is baked, yet the preview can be switched on"
+        assert not bpy.ops.prt.clear.poll() and not bpy.ops.prt.cancel.poll()
+
+
+def analyze() -> Step:
+    """Analyze fills the panel and changes nothing."""
+    with override():
+        assert bpy.ops.prt.analyze() == {"FINISHED"}
+    assert session().analysis
+    yield 1.0
+    shoot("02_analysis")
+    assert carrier("Statue") is None
+
+
+def bake() -> Step:
+    """A bake runs beside Blender, shows its progress, and stores its result in the selected object alone."""
+    bpy.context.scene.prt.preset = "standard"
+    select("Statue", "Floor")
+    assert invoke_bake() == {"RUNNING_MODAL"}
+    assert session().running and len(children()) == 1
+    yield from wait_for_bake("03_baking")
+    yield 1.0
+    shoot("04_baked")
+    assert not session().failed, session().message
+    assert carrier("Statue") and carrier("Floor") and carrier("Wall") is None
+    assert {line.name for line in session().objects} == {"Statue", "Floor"}
+    assert not any(line.stale for line in session().objects), [line.stale for line in session().objects]
+    assert not children()
+
+
+def undo_and_redo() -> Step:
+    """One undo takes the bake away, redo brings it back, and the panel follows."""
+    with override():
+        bpy.ops.ed.undo()
+    yield 0.5
+    assert carrier("Statue") is None and not session().objects
+    with override():
+        bpy.ops.ed.redo()
+    yield 0.5
+    assert carrier("Statue") is not None and len(session().objects) == 2
+
+
+def bake_all() -> Step:
+    """With nothing selected, all visible meshes are baked."""
+    bpy.context.scene.prt.preset = "draft"
+    select()
+    assert invoke_bake() == {"RUNNING_MODAL"}
+    yield from wait_for_bake()
+    assert not session().failed, session().message
+    yield 0.5
+    assert {line.name for line in session().objects} == {"Statue", "Floor", "Wall"}
+
+
+def cancel() -> Step:
+    """Cancel ends the child soon and keeps the previous bake; so does Esc."""
+    before = carrier("Statue")["prt_header"]
+    for way in ("operator", "escape"):
+        bpy.context.scene.prt.preset = "high"
+        assert invoke_bake() == {"RUNNING_MODAL"}
+        while session().fraction <= 0.02 and session().running:
+            yield 0.05
+        assert session().running, session().message
+        started = time.monotonic()
+        if way == "operator":
+            assert bpy.ops.prt.cancel() == {"FINISHED"}
+        else:
+            box = region()
+            subprocess.run(["xdotool", "mousemove", str(box.x + box.width // 3), str(500), "key", "Escape"], check=True)
+        while session().running:
+            assert time.monotonic() - started < 3.0, f"{way} does not cancel"
+            yield 0.05
+        assert not children(), "the child outlived its cancel"
+        assert "cancel" in session().message.lower() and not session().failed
+        assert carrier("Statue")["prt_header"] == before
+    yield 0.5
+    shoot("05_cancelled")
+    bpy.context.scene.prt.preset = "draft"
+
+
+def preview() -> Step:
+    """The preview changes the picture, and Blender's own returns with it off."""
+    yield 1.0
+    off = view(shoot("06_preview_off"))
+    with override():
+        assert bpy.ops.prt.toggle_preview() == {"FINISHED"}
+    yield 1.5
+    on = view(shoot("07_preview_on"))
+    assert session().preview and not session().preview_message, session().preview_message
+    assert np.abs(on - off).mean() > 2.0, "switching the preview on changes nothing"
+    with override():
+        bpy.ops.prt.toggle_preview()
+    yield 1.0
+    again = view(shoot("08_preview_off_again"))
+    assert np.abs(again - off).mean() < 0.5, "the preview leaves traces"
+    with override():
+        bpy.ops.prt.toggle_preview()
+    yield 1.0
+
+
+def follow_light() -> Step:
+    """Sun, HDRI, strength, exposure: the picture follows without a click."""
+    before = view(shoot("09_light_before"))
+    bpy.data.objects["Sun"].rotation_euler = (1.2, 0.0, -2.0)
+    yield 1.0
+    sun = view(shoot("10_sun_moved"))
+    assert np.abs(sun - before).mean() > 1.0, "moving the Sun changes nothing"
+    mapping = next(n for n in bpy.context.scene.world.node_tree.nodes if n.type == "MAPPING")
+    mapping.inputs["Rotation"].default_value[2] = 2.5
+    yield 1.0
+    turned = view(shoot("11_hdri_turned"))
+    assert np.abs(turned - sun).mean() > 1.0, "turning the HDRI changes nothing"
+    bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.2
+    yield 1.0
+    darker = view(shoot("12_strength"))
+    assert darker.mean() < turned.mean(), "a weaker World is not darker"
+    bpy.context.scene.prt.exposure = 2.0
+    yield 1.0
+    brighter = view(shoot("13_exposure"))
+    assert brighter.mean() > darker.mean(), "exposure does not brighten"
+    bpy.context.scene.prt.exposure = 0.0
+    bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 1.0
+    bpy.data.lights["Sun"].energy = 0.0
+    yield 1.0
+    no_sun = view(shoot("14_no_sun"))
+    assert np.abs(no_sun - turned).mean() > 0.5, "the Sun's strength does nothing"
+
+
+def warn_stale() -> Step:
+    """An edited mesh makes its bake stale, and the panel says so."""
+    bpy.data.objects["Statue"].data.vertices[0].co.x += 0.3
+    bpy.data.objects["Statue"].data.update()
+    bpy.context.view_layer.update()
+    yield 2.0
+    shoot("15_stale")
+    line = session().objects["Statue"]
+    assert line.stale, "an edited mesh is not reported as stale"
+
+
+def survive_reload() -> Step:
+    """Save and load: the bakes are back, and the preview stays in step."""
+    path = OUTPUT / "saved.blend"
+    with override():
+        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=True)
+    yield 2.0
+    assert {line.name for line in session().objects} == {"Statue", "Floor", "Wall"}
+    shoot("16_reloaded")
+
+
+def load_during_bake() -> Step:
+    """Loading another file during a bake ends the child and nothing else happens."""
+    bpy.context.scene.prt.preset = "high"
+    assert invoke_bake() == {"RUNNING_MODAL"}
+    yield 1.0
+    with override():
+        bpy.ops.wm.open_mainfile(filepath=str(OUTPUT / "saved.blend"), load_ui=False)
+    yield 1.0
+    assert not children() and not session().running
+
+
+def clear() -> Step:
+    """Clear removes the selected object's bake alone, then all."""
+    select("Statue")
+    with override():
+        assert bpy.ops.prt.clear() == {"FINISHED"}
+    yield 0.5
+    assert carrier("Statue") is None and carrier("Floor") is not None
+    select()
+    with override():
+        assert bpy.ops.prt.clear() == {"FINISHED"}
+    yield 0.5
+    assert carrier("Floor") is None and not session().objects
+    assert not [mesh.name for mesh in bpy.data.meshes if mesh.name.startswith("PRT ")]
+    shoot("17_cleared")
+
+
+def disable() -> Step:
+    """Disabling leaves no handler, no type and no property behind."""
+    handlers = bpy.app.handlers
+    bpy.ops.preferences.addon_disable(module=MODULE)
+    yield 0.5
+    left = [f for name in dir(handlers) if isinstance(getattr(handlers, name), list)
+            for f in getattr(handlers, name) if getattr(f, "__module__", "").startswith(MODULE)]
+    assert not left, left
+    assert not hasattr(bpy.types.Scene, "prt") and not hasattr(bpy.types, "PRT_PT_bake")
+    bpy.ops.preferences.addon_enable(module=MODULE)
+    yield 0.5
+    assert hasattr(bpy.types.Scene, "prt")
+    shoot("18_enabled_again")
+
+
+STEPS = (open_scene, analyze, bake, undo_and_redo, bake_all, cancel, preview, follow_light, warn_stale, survive_reload,
+         load_during_bake, clear, disable)
+
+
+def run_steps(steps: tuple[Callable[[], Step], ...]) -> Iterator[float]:
+    """Run the steps one after the other; a failure is noted and the next step goes on."""
+    results: list[tuple[str, str]] = []
+    for step in steps:
+        failure = ""
+        try:
+            yield from step()
+        except Exception:  # whatever a step raises is its result
+            failure = traceback.format_exc()
+            print(failure, flush=True)
+        results.append((step.__name__, failure))
+        (OUTPUT / "interface.json").write_text(json.dumps(results), encoding="utf-8")
+        print(f"{'failed' if failure else 'passed'}: {step.__name__}", flush=True)
+
+
+_running = run_steps(STEPS)
+
+
+def advance() -> float | None:
+    try:
+        return next(_running)
+    except StopIteration:
+        bpy.context.preferences.view.use_save_prompt = False
+        bpy.ops.wm.quit_blender()
+        return None
+
+
+bpy.context.preferences.view.show_splash = False
+bpy.app.timers.register(advance, first_interval=2.0, persistent=True)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tests of the zip that users install, in a real Blender with its user interface.
+
+    python tests/interface/run.py --zip prt-linux-x64.zip --output FOLDER --ui "COMMAND" --headless "COMMAND"
+
+COMMAND starts Blender with an interface (under Xvfb where there is no display) and in background mode; the arguments
+of this script are appended to it. BLENDER_USER_RESOURCES names a fresh folder, so that no user's set-up is touched.
+Screenshots, for a person to look at, and Blender's own output land in FOLDER. The last line is "N passed, M failed".
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+UI_SECONDS = 600
+COMMAND_SECONDS = 240
+
+
+class Blender:
+    """A Blender of its own preferences folder."""
+
+    def __init__(self, ui: str, headless: str, output: Path, resources: Path) -> None:
+        self.ui, self.headless, self.output = shlex.split(ui), shlex.split(headless), output
+        self.environment = {**os.environ, "BLENDER_USER_RESOURCES": str(resources)}
+
+    def command(self, *arguments: str, seconds: float = COMMAND_SECONDS) -> subprocess.CompletedProcess[str]:
+        """Run in background mode."""
+        return subprocess.run([*self.headless, *arguments], env=self.environment, capture_output=True, text=True,
+                              timeout=seconds)
+
+    def start_command(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start in background mode and do not wait, in a process group of its own as a terminal does."""
+        return subprocess.Popen([*self.headless, *arguments], env=self.environment, stdout=subprocess.PIPE,
+                                stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+    def script(self, name: str, *arguments: str) -> None:
+        """Run a script with the interface; its output lands in the output folder."""
+        with open(self.output / f"{name}.log", "w", encoding="utf-8") as log:
+            subprocess.run([*self.ui, "--python-exit-code", "1", "--python", str(HERE / name), "--", *arguments],
+                           env=self.environment, stdout=log, stderr=subprocess.STDOUT, timeout=UI_SECONDS, check=False)
+
+
+def check_install(blender: Blender, zip_file: Path) -> None:
+    """Installs, enables, and its command is known."""
+    done = blender.command("--command", "extension", "install-file", "-r", "user_default", "--enable", str(zip_file))
+    assert done.returncode == 0, done.stdout + done.stderr
+    listed = blender.command("--command", "prt", "--help")
+    assert listed.returncode == 0 and "bake" in listed.stdout + listed.stderr, listed.stdout + listed.stderr
+
+
+def check_command_bake(blender: Blender, scene: Path) -> None:
+    """`blender --command prt bake`: exit 0, stdout is the paths alone, the files are there, the input is unchanged."""
+    before = scene.read_bytes()
+    baked, report = blender.output / "baked.blend", blender.output / "report.json"
+    done = blender.command("--command", "prt", "bake", "--input", str(scene), "--output", str(baked),
+                           "--preset", "draft", "--report", str(report))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [str(baked), str(report)], done.stdout
+    assert json.loads(report.read_text())["seconds"] > 0.0
+    assert scene.read_bytes() == before
+    drawn = blender.output / "command_preview.png"
+    done = blender.command("--command", "prt", "preview", "--input", str(baked), "--output", str(drawn),
+                           "--size", "640x400")
+    assert done.returncode == 0 and drawn.stat().st_size > 1000, done.stderr
+    arrays = blender.output / "relit.npz"
+    done = blender.command("--command", "prt", "relight", "--input", str(baked), "--use-scene-lights", "--output",
+                           str(arrays))
+    assert done.returncode == 0 and arrays.is_file(), done.stderr
+
+
+def check_bad_arguments(blender: Blender, scene: Path) -> None:
+    """Exit 2 and one line of ours."""
+    for arguments in (["bake"], ["bake", "--input", str(scene), "--output", "x.blend", "--preset", "best"],
+                      ["dance"], ["analyze", "--input", "absent.blend"]):
+        done = blender.command("--command", "prt", *arguments)
+        ours = [line for line in done.stderr.splitlines() if line.startswith("prt:")]
+        assert done.returncode == 2 and len(ours) == 1, (arguments, done.returncode, done.stderr)
+        assert "Traceback" not in done.stderr and not done.stdout, (arguments, done.stdout)
+
+
+def check_interrupt(blender: Blender, scene: Path) -> None:
+    """Ctrl-C during a bake: exit 3, nothing written, no child left."""
+    output = blender.output / "interrupted.blend"
+    running = blender.start_command("--command", "prt", "bake", "--input", str(scene), "--output", str(output),
+                                    "--preset", "high", "--set", "directions=65536")
+    for line in running.stderr:
+        if line.startswith("prt:"):
+            break
+    time.sleep(1.0)
+    os.killpg(running.pid, signal.SIGINT)
+    _, errors = running.communicate(timeout=30)
+    assert running.returncode == 3, (running.returncode, errors)
+    assert "resume" in errors and "Traceback" not in errors, errors
+    assert not output.exists()
+
+
+def interface_results(blender: Blender, scene: Path) -> list[tuple[str, str]]:
+    """Name and failure (empty: passed) of each step in_blender.py took."""
+    results = blender.output / "interface.json"
+    blender.script("in_blender.py", str(blender.output), str(scene))
+    if not results.is_file():
+        return [("the interface script", f"left no results; see {blender.output / 'in_blender.py.log'}")]
+    return [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+
+
+def run_check(check: Callable[..., None], *arguments: object) -> tuple[str, str]:
+    """The check's name and its failure."""
+    try:
+        check(*arguments)
+    except (AssertionError, subprocess.TimeoutExpired, OSError) as error:
+        return check.__name__, f"{type(error).__name__}: {error}"
+    return check.__name__, ""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--zip", type=Path, required=True)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--ui", default="blender")
+    parser.add_argument("--headless", default="blender --background")
+    parser.add_argument("--only", choices=("commands", "interface"), default=None)
+    arguments = parser.parse_args()
+    output = arguments.output.resolve()
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    with tempfile.TemporaryDirectory() as resources:
+        blender = Blender(arguments.ui, arguments.headless, output, Path(resources))
+        outcomes = [run_check(check_install, blender, arguments.zip.resolve())]
+        scene = output / "scene.blend"
+        made = blender.command("--python-exit-code", "1", "--python", str(HERE / "make_scene.py"), "--", str(scene))
+        outcomes.append(("make_scene", "" if made.returncode == 0 and scene.is_file() else made.stdout + made.stderr))
+        if arguments.only != "interface":
+            outcomes += [run_check(check, blender, scene)
+                         for check in (check_bad_arguments, check_command_bake, check_interrupt)]
+        if arguments.only != "commands":
+            outcomes += interface_results(blender, scene)
+    for name, failure in outcomes:
+        print(f"{'failed' if failure else 'passed'}: {name}" + (f"\n    {failure}" if failure else ""))
+    failed = sum(bool(failure) for _, failure in outcomes)
+    print(f"{len(outcomes) - failed} passed, {failed} failed")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
