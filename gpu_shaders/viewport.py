@@ -8,7 +8,10 @@ framebuffer of its region and the second draws into it. That a region's picture 
 internal to Blender: where it can't be bound or has another size, objects are drawn over the overlays instead (the
 colours of the Standard view transform) and `status()` says so.
 
-The objects themselves stay visible and are covered exactly: selection, outlines and occlusion stay right.
+The objects themselves stay visible and are covered exactly: selection, outlines and occlusion stay right. Where other
+objects take part, the depth in the picture decides; Blender's floor grid has written its lines into that depth, so
+that below the floor the original shows through the lines, and EEVEE's depth is of one jittered sample, so that the
+original shows in single pixels along creases. Both end when `is_complete` says that only listed objects are visible.
 Handlers do not run in final renders nor in viewport renders.
 """
 
@@ -29,6 +32,11 @@ from .render_data import DrawItem
 
 SPACE = bpy.types.SpaceView3D
 GetDrawList = Callable[[], Sequence[DrawItem]]
+IsComplete = Callable[[], bool]
+
+
+def _never_complete() -> bool:
+    return False
 
 
 @dataclass
@@ -50,6 +58,7 @@ class _Viewport:
     """Everything that lives between `enable` and `disable`."""
 
     get_draw_list: GetDrawList
+    is_complete: IsComplete
     handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
     framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
@@ -59,17 +68,18 @@ class _Viewport:
 _active: _Viewport | None = None
 
 
-def enable(get_draw_list: GetDrawList) -> None:
-    """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the list is replaced.
+def enable(get_draw_list: GetDrawList, is_complete: IsComplete = _never_complete) -> None:
+    """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the callables change.
 
     get_draw_list runs on every redraw of every region, with bpy.context of that region: it must be cheap, and may
-    raise PRTError, which `status()` then shows.
+    raise PRTError, which `status()` then shows. is_complete runs after it and says whether the listed objects are the
+    only visible surfaces of the region; then they hide each other by their own depth alone.
     """
     global _active
     if _active is not None:
-        _active.get_draw_list = get_draw_list
+        _active.get_draw_list, _active.is_complete = get_draw_list, is_complete
     else:
-        _active = _Viewport(get_draw_list)
+        _active = _Viewport(get_draw_list, is_complete)
         for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW")):
             _active.handlers.append(SPACE.draw_handler_add(handler, (), "WINDOW", phase))
     redraw()
@@ -141,7 +151,7 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
         viewport.cache.draw(items, view_projection)
         return
     with framebuffer.bind():
-        if _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
+        if viewport.is_complete() or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
             framebuffer.clear(depth=1.0)
         viewport.cache.draw(items, view_projection)
 

@@ -27,7 +27,7 @@ class PRT_OT_analyze(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
-            analysis = analyze_scene(context.scene, settings(context))
+            analysis = analyze_scene(context.evaluated_depsgraph_get(), settings, None)
         except PRTError as error:
             assign(session(context), analysis="", message=str(error), failed=True)
             self.report({"ERROR"}, str(error))

@@ -35,7 +35,7 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
 
     def start_job(self, context: bpy.types.Context) -> BakeSession:
         settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
-        return BakeSession.start(context.scene, settings(context))
+        return BakeSession.start(context.evaluated_depsgraph_get(), settings, None)
 
     def finish_job(self, context: bpy.types.Context, job: BakeSession) -> str:
         result = job.store()

@@ -71,8 +71,10 @@ class JobMixin:
         try:
             self._begin(context)
         except PRTError as error:
-            self._end(context)
             return self._fail(context, error)
+        finally:
+            if JobMixin.running is None:
+                self._end(context)
         self._timer = context.window_manager.event_timer_add(POLL_SECONDS, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0.0, 1.0)

@@ -18,11 +18,12 @@ import bpy  # first: in the wheel, the other two exist only after it
 import bmesh
 from mathutils import Euler, Matrix, Vector
 
+STRENGTH = 0.75  # of the HDRI, so that white stays below the display's white
 Colour = tuple[float, float, float]
 Shape = Callable[[bmesh.types.BMesh], object]
 
-WHITE, GREY = (0.72, 0.68, 0.62), (0.55, 0.55, 0.55)
-RED, TEAL, AMBER = (0.72, 0.07, 0.04), (0.03, 0.36, 0.38), (0.80, 0.42, 0.04)
+WHITE, GREY = (0.62, 0.58, 0.53), (0.36, 0.35, 0.34)
+RED, TEAL, AMBER = (0.60, 0.03, 0.015), (0.01, 0.24, 0.27), (0.70, 0.27, 0.01)
 
 
 def add_object(name: str, shape: Shape, colour: Colour, placed: Matrix, smooth: bool = False) -> bpy.types.Object:
@@ -66,21 +67,21 @@ def add_shapes() -> None:
     add_object("Ground", lambda m: bmesh.ops.create_grid(m, x_segments=110, y_segments=110, size=5.0), GREY,
                placed(0.0, 0.0, 0.0))
     suzanne = add_object("Suzanne", lambda m: bmesh.ops.create_monkey(m), WHITE,
-                         placed(0.05, 0.0, 0.83, (-38.0, 0.0, 8.0)), smooth=True)
+                         placed(0.0, 0.0, 0.51, (-35.0, 0.0, 10.0)), smooth=True)
     suzanne.modifiers.new("Subdivision", "SUBSURF").levels = 2
-    add_object("Red wall", box((0.16, 2.3, 1.9), 20), RED, placed(-1.75, 0.15, 0.951, (0.0, 0.0, -8.0)))
+    add_object("Red wall", box((0.16, 2.3, 1.9), 20), RED, placed(-1.5, 0.25, 0.951, (0.0, 0.0, -8.0)))
     add_object("Teal pillar", lambda m: bmesh.ops.create_cone(
-        m, cap_ends=True, segments=64, radius1=0.42, radius2=0.42, depth=1.5), TEAL, placed(1.75, 0.55, 0.751))
+        m, cap_ends=True, segments=64, radius1=0.42, radius2=0.42, depth=1.5), TEAL, placed(1.7, 0.75, 0.751))
     add_object("Amber ball", lambda m: bmesh.ops.create_icosphere(m, subdivisions=5, radius=0.38), AMBER,
-               placed(1.25, -0.95, 0.381), smooth=True)
+               placed(1.15, -0.75, 0.381), smooth=True)
 
 
 def add_camera() -> None:
     """A camera that looks down at Suzanne from the front."""
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     camera.data.lens = 52.0
-    camera.location = (0.5, -6.4, 2.6)
-    camera.rotation_euler = (Vector((0.05, 0.0, 0.72)) - camera.location).to_track_quat("-Z", "Y").to_euler()
+    camera.location = (0.6, -6.0, 2.5)
+    camera.rotation_euler = (Vector((0.1, 0.0, 0.62)) - camera.location).to_track_quat("-Z", "Y").to_euler()
     scene = bpy.context.scene
     scene.collection.objects.link(camera)
     scene.camera = camera
@@ -101,6 +102,7 @@ def add_world(name: str, folder: Path) -> None:
         "ShaderNodeOutputWorld"))
     mapping.vector_type = "POINT"
     environment.image = bpy.data.images.load(str(copied))
+    background.inputs["Strength"].default_value = STRENGTH
     tree.links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
     tree.links.new(mapping.outputs["Vector"], environment.inputs["Vector"])
     tree.links.new(environment.outputs["Color"], background.inputs["Color"])

@@ -85,7 +85,7 @@ def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | No
     return scene, BakeSettings(**header["settings"]), light, header["geometry_digests"]
 
 
-def run_job(folder: Path) -> Generator[Progress, None, None]:
+def run_job(folder: Path) -> Generator[Progress]:
     """Bake a job, resuming after its finished stages, and leave the result in its folder."""
     if (folder / RESULT_FILE).exists():
         return

@@ -17,7 +17,7 @@ class BakeSettings:
     """Settings of a bake. What each buys and costs.
 
     order: of the spherical harmonics (order^2 coefficients per receiver); higher = sharper shadows, more memory.
-    directions: shadow rays per receiver over the whole sphere (half are traced); error falls about as 1/directions^0.75.
+    directions: shadow rays per receiver over the whole sphere (half of them are traced).
     gather_directions: rays over the sphere that carry bounced light.
     bounces: of light; -1 = until less than bounce_error of the energy is left.
     bounce_error: relative energy that may be left out of the bounces.
@@ -111,7 +111,9 @@ def check(settings: BakeSettings) -> BakeSettings:
     for name, (low, high, why) in _LIMITS.items():
         value = getattr(settings, name)
         if not low <= value <= high:  # also catches NaN
-            raise BadArguments(f"setting {name}", f"{value} is outside {low:g} to {high:g} ({why})", "Choose a value inside")
+            raise BadArguments(f"setting {name}", f"{value} is outside {low:g} to {high:g} ({why})",
+                               "Choose a value inside")
     if settings.encoder not in METHODS:
-        raise BadArguments("setting encoder", f"{settings.encoder!r} is not an encoder", f"Use one of {', '.join(METHODS)}")
+        raise BadArguments("setting encoder", f"{settings.encoder!r} is not an encoder",
+                           f"Use one of {', '.join(METHODS)}")
     return settings

@@ -37,7 +37,8 @@ class ReferenceLight:
     @staticmethod
     def of(image: NDArray[np.floating], rotation: NDArray[np.float64] | None,
            suns: list[tuple[NDArray[np.float64], NDArray[np.float64], float]], description: str) -> ReferenceLight:
-        """From an equirectangular image (h, w, 3), its rotation R, f(R^-1 s), and suns (direction, irradiance, angle)."""
+        """From an equirectangular image (h, w, 3), its rotation R, f(R^-1 s), and suns (direction, irradiance, angle).
+        """
         small = averaged(image, REFERENCE_WIDTH)
         if rotation is not None:
             small = _turned(small, np.asarray(rotation, np.float64))
@@ -119,7 +120,7 @@ def _turned(image: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArra
 
 
 def stand_in_light() -> ReferenceLight:
-    """A clear sky that brightens towards a broad glow, over darker ground: what a scene without light is judged under."""
+    """A clear sky that brightens towards a broad glow, over darker ground: to judge a scene without light under."""
     rows, columns = np.arange(64)[:, None], np.arange(128)[None, :]
     directions = direction_of_pixel(rows, columns, 64, 128)
     glow = np.array([0.6, -0.4, 0.69282])

@@ -55,8 +55,8 @@ def decide(scene: SceneMesh, order: int, bounces: int, planned_rays: tuple[int, 
     if needs.bounces and _coloured(scene):
         needs.channels = 3
     else:
-        why = "every albedo that bounces light is grey" if needs.bounces else "no light is bounced, so none takes on colour"
-        needs.left_out.append(LeftOut("two of three colour channels", why, "2/3 of bases and of bounce and encoding work"))
+        why = "every albedo that bounces light is grey" if needs.bounces else "no light is bounced to take on colour"
+        needs.left_out.append(LeftOut("two of three colour channels", why, "2/3 of bases, bounce and encoding work"))
     if light_order is not None and light_order < order:
         _lower_order(needs, light_order, fit_order_to_light)
     return needs
@@ -91,8 +91,8 @@ def _lower_order(needs: Needs, light_order: int, fit: bool) -> None:
                                       "the scene's light carries no energy there", saved))
         needs.order = light_order
     else:
-        needs.hints.append(f"the present light needs order {light_order} only; fit_order_to_light=true would save {saved},"
-                           " but a later light with more detail would need a new bake")
+        needs.hints.append(f"the present light needs order {light_order} only; fit_order_to_light=true would save"
+                           f" {saved}, but a later light with more detail would need a new bake")
 
 
 def is_lone_convex(scene: SceneMesh) -> bool:

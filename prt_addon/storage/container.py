@@ -112,7 +112,7 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
         raise StorageError(subject, "its weights do not fit the header", REBAKE)
     if len(positions) != points or len(albedo) != points or len(normals) != points:
         raise StorageError(subject, f"the mesh has {len(positions)} points, the baked data {points}", REBAKE)
-    if points and not (0 <= int(cluster.min()) and int(cluster.max()) < clusters):
+    if points and not (int(cluster.min()) >= 0 and int(cluster.max()) < clusters):
         raise StorageError(subject, "a cluster index is out of range", REBAKE)
     weights = np.concatenate([*packed_weights, np.zeros((points, 0), np.float32)], axis=1)[:, :vectors]
     bases = np.asarray(flat_bases, np.float32).reshape(clusters, representatives, rows, columns, channels)

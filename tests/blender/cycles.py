@@ -21,6 +21,8 @@ def use_cycles(samples: int) -> bpy.types.World:
     scene.world = bpy.data.worlds.new("World")
     if scene.world.node_tree is None:
         scene.world.use_nodes = True
+    # The automatic importance map takes seconds to build and serves large pictures.
+    scene.world.cycles.sampling_method, scene.world.cycles.sample_map_resolution = "MANUAL", 512
     background = scene.world.node_tree.nodes["Background"]
     background.inputs["Color"].default_value = (0, 0, 0, 1)
     return scene.world
@@ -67,3 +69,62 @@ def baked_irradiance(facets: bpy.types.Object) -> np.ndarray:
     colours = np.empty(4 * len(mesh.vertices), np.float32)
     mesh.color_attributes["bake"].data.foreach_get("color", colours)
     return colours.reshape(-1, 3, 4)[:, :, :3].mean(axis=1).astype(np.float64)
+
+
+def smooth_environment(width: int = 256) -> np.ndarray:
+    """A smooth coloured equirectangular environment (width / 2, width, 3) without symmetry, radiance 0.2 to 4."""
+    from prt_addon.lighting.environment import direction_of_pixel
+
+    rows, columns = np.arange(width // 2)[:, None], np.arange(width)[None, :]
+    directions = direction_of_pixel(rows, columns, width // 2, width)
+    image = np.full((width // 2, width, 3), 0.2)
+    for axis, sharpness, colour in (((0.7, 0.2, 0.6), 4.0, (3.0, 2.4, 1.6)), ((-0.5, 0.8, 0.3), 3.0, (0.3, 0.8, 1.4)),
+                                    ((0.1, -0.9, -0.3), 2.0, (0.5, 0.2, 0.4))):
+        towards = np.asarray(axis) / np.linalg.norm(axis)
+        image += np.exp(sharpness * ((directions * towards).sum(axis=-1, keepdims=True) - 1.0)) * np.asarray(colour)
+    return image.astype(np.float32)
+
+
+def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.World:  # noqa: ANN001
+    """Give the scene a world of this equirectangular image, turned by a Mapping node (type Point)."""
+    from pathlib import Path
+
+    path = Path(folder) / "environment.exr"
+    stored = bpy.data.images.new("environment", image.shape[1], image.shape[0], float_buffer=True)
+    stored.colorspace_settings.name = "Linear Rec.709"
+    pixels = np.ones((*image.shape[:2], 4), np.float32)
+    pixels[..., :3] = image[::-1]  # Blender's images start at the bottom
+    stored.pixels.foreach_set(pixels.ravel())
+    stored.filepath_raw, stored.file_format = str(path), "OPEN_EXR"
+    stored.save()
+    bpy.data.images.remove(stored)
+    world = bpy.data.worlds.new("Environment")
+    if world.node_tree is None:
+        world.use_nodes = True
+    tree = world.node_tree
+    texture, mapping = tree.nodes.new("ShaderNodeTexEnvironment"), tree.nodes.new("ShaderNodeMapping")
+    coordinate = tree.nodes.new("ShaderNodeTexCoord")
+    texture.image = bpy.data.images.load(str(path))
+    mapping.inputs["Rotation"].default_value = (0.0, 0.0, math.radians(degrees))
+    tree.links.new(coordinate.outputs["Generated"], mapping.inputs["Vector"])
+    tree.links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
+    tree.links.new(texture.outputs["Color"], tree.nodes["Background"].inputs["Color"])
+    bpy.context.scene.world = world
+    return world
+
+
+def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) -> np.ndarray:
+    """Unit-albedo exit radiance (v, 3) of an object's vertices under the scene's light, baked by Cycles."""
+    mesh = thing.data
+    attribute = mesh.color_attributes.get("bake") or mesh.color_attributes.new("bake", "FLOAT_COLOR", "POINT")
+    mesh.color_attributes.active_color = attribute
+    bpy.ops.object.select_all(action="DESELECT")
+    bpy.context.view_layer.objects.active = thing
+    thing.select_set(True)
+    bpy.context.scene.cycles.seed = seed
+    bpy.context.scene.render.bake.use_pass_color = False
+    bpy.ops.object.bake(type="DIFFUSE", pass_filter=passes, target="VERTEX_COLORS", use_clear=True)
+    colours = np.empty(4 * len(mesh.vertices), np.float32)
+    mesh.color_attributes["bake"].data.foreach_get("color", colours)
+    mesh.color_attributes.remove(mesh.color_attributes["bake"])
+    return colours.reshape(-1, 4)[:, :3].astype(np.float64)

@@ -72,17 +72,16 @@ def test_one_bright_pixel_lights_from_where_cycles_says(tmp_path: Path, row: int
     image[row, column] = (50, 100, 200)
     path = write_image(tmp_path / "pixel.exr", image)
     rotation = None if degrees is None else world_rotation(degrees)
-    set_world(use_cycles(64), path, None if degrees is None else (0, 0, math.radians(degrees)))
+    set_world(use_cycles(512), path, None if degrees is None else (0, 0, math.radians(degrees)))
     theirs, ours = baked_irradiance(add_white_facets(NORMALS)), our_irradiance(path, rotation)
     expected = direction_of_pixel(row, column, 32, 64)
     expected = expected if rotation is None else rotation @ expected
     found = brightest_direction(theirs[:, 1])
     assert math.degrees(math.acos(min(found @ expected, 1))) < 1  # a pixel is 5.6 degrees wide
 
-    print('PIX',math.degrees(math.acos(min(found @ expected, 1))),np.abs(ours - theirs).max()/theirs.max(),theirs.sum(0)/ours.sum(0))
     # Cycles blurs between pixels, which changes the irradiance a little.
-    assert np.abs(ours - theirs).max() < 0.02 * theirs.max()
-    np.testing.assert_allclose(theirs.sum(axis=0), ours.sum(axis=0), rtol=0.01)
+    assert np.abs(ours - theirs).max() < 0.01 * theirs.max()
+    np.testing.assert_allclose(theirs.sum(axis=0), ours.sum(axis=0), rtol=5e-3)
 
 
 def smooth_image() -> np.ndarray:
@@ -99,11 +98,10 @@ def test_a_coloured_sky_gives_cycles_irradiance(tmp_path: Path, rotation: tuple[
     """And any rotation M of the Mapping node (type Point) turns the environment by the inverse of M."""
     path = write_image(tmp_path / "sky.exr", smooth_image())
     turned = None if rotation is None else np.array(Euler(rotation).to_matrix()).T
-    set_world(use_cycles(128), path, rotation)
+    set_world(use_cycles(512), path, rotation)
     theirs, ours = baked_irradiance(add_white_facets(NORMALS)), our_irradiance(path, turned)
-    print('REL',np.sqrt(((ours - theirs) ** 2).mean() / (theirs**2).mean()))
     relative = np.sqrt(((ours - theirs) ** 2).mean() / (theirs**2).mean())
-    assert relative < 0.01
+    assert relative < 0.008
     if rotation is not None and rotation[:2] == (0.0, 0.0):
         np.testing.assert_allclose(turned, world_rotation(math.degrees(rotation[2])), atol=1e-6)
 

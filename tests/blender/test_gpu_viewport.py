@@ -157,6 +157,16 @@ def test_depth_is_replaced_only_where_the_engine_leaves_none(
     assert covered(pixels) == drawn and pixels.any() == drawn
 
 
+def test_a_complete_list_hides_by_its_own_depth(
+    handlers: list, monkeypatch: pytest.MonkeyPatch, item: render_data.DrawItem
+) -> None:
+    complete = [True]
+    viewport.enable(lambda: [item], lambda: complete[0])
+    assert covered(draw_redraw(handlers, monkeypatch, depth=0.0))
+    complete[0] = False
+    assert not draw_redraw(handlers, monkeypatch, depth=0.0).any()
+
+
 @pytest.mark.parametrize("space", [space_data("WIREFRAME"), space_data("SOLID", xray=True)])
 def test_see_through_shading_is_left_alone(
     handlers: list, monkeypatch: pytest.MonkeyPatch, item: render_data.DrawItem, space: Any

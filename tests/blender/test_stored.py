@@ -315,7 +315,8 @@ DAMAGE = {
     "no json": (lambda m: m.__setitem__("prt_header", "{"), "not readable"),
     "lost attribute": (lambda m: m.attributes.remove(m.attributes["prt_weights_1"]), "prt_weights_1"),
     "lost bases": (lambda m: m.__delitem__("prt_bases"), "no bases"),
-    "cut bases": (lambda m: m.__setitem__("prt_bases", np.zeros(5, np.float32)), "bases hold 5"),
+    "cut bases": (lambda m: (m.__delitem__("prt_bases"), m.__setitem__("prt_bases", np.zeros(5, np.float32))),
+                  "bases hold 5"),
     "bad matrix": (lambda m: _set_header(m, matrix=[1.0]), "transform"),
     "cluster": (lambda m: setattr(m.attributes["prt_cluster"].data[0], "value", 99), "cluster index"),
 }

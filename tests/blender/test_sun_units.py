@@ -47,7 +47,6 @@ def test_units_and_angle_equal_cycles(degrees: float, normalize: bool) -> None:
     # Strengths so that the plane below is lit by about 1 either way.
     placed = add_sun(3.0, math.radians(degrees), (0.0, 0.0, 0.0), normalize)
     theirs, ours = baked_irradiance(add_white_facets(NORMALS)), our_irradiance(placed, 80)
-    print('SUN',degrees,normalize,(ours[:3]/theirs[:3]).min()-1,(ours[:3]/theirs[:3]).max()-1,abs(ours[3]-theirs[3]).max())
     np.testing.assert_allclose(ours[:3], theirs[:3], rtol=5e-3)
     np.testing.assert_allclose(ours[3], theirs[3], atol=5e-3 * theirs.max())
 

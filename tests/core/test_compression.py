@@ -6,6 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sklearn.cluster import KMeans
+from sklearn.decomposition import PCA
+
 from prt_addon.compression import global_frame as frames
 from prt_addon.compression import reclassify as classification
 from prt_addon.compression.adaptive import adaptation_pays, distribute
@@ -17,8 +20,6 @@ from prt_addon.compression.settings import EncoderSettings
 from prt_addon.compression.subspaces import from_labels, update
 from prt_addon.compression.vector_quantization import lbg
 from prt_addon.errors import BadArguments, Cancelled, PRTError
-from sklearn.cluster import KMeans
-from sklearn.decomposition import PCA
 
 METHODS = ("static", "iterative", "adaptive")
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import sparse
-from tests.core.shapes import box, drain, join, plane, sphere
 
 from prt_addon.basis.directions import quadrature
 from prt_addon.basis.spherical_harmonics import evaluate
@@ -16,6 +15,7 @@ from prt_addon.transport.direct import direct_transfer, unshadowed_transfer
 from prt_addon.transport.gather import gather_operator
 from prt_addon.transport.interreflection import interreflect
 from prt_addon.transport.receiver_set import ReceiverSet
+from tests.core.shapes import box, drain, join, plane, sphere
 
 WHITE = np.sqrt(4.0 * np.pi)  # coefficient 0 of the unit environment
 

@@ -88,10 +88,17 @@ def invoke_bake() -> set[str]:
         return bpy.ops.prt.bake("INVOKE_DEFAULT")
 
 
-def children() -> list[str]:
-    """Command lines of this process's living children."""
-    listed = subprocess.run(["ps", "-o", "args=", "--ppid", str(os.getpid())], capture_output=True, text=True)
-    return [line for line in listed.stdout.splitlines() if "worker.py" in line]
+def children() -> list[int]:
+    """Process numbers of the living bake processes (Linux: /proc)."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command, status = (folder / "cmdline").read_bytes(), (folder / "stat").read_text()
+        except OSError:  # it ended meanwhile
+            continue
+        if b"worker.py" in command and status.rpartition(")")[2].split()[1] == str(os.getpid()):
+            found.append(int(folder.name))
+    return found
 
 
 def carrier(name: str) -> bpy.types.Mesh | None:
@@ -107,7 +114,7 @@ def open_scene() -> Step:
         bpy.ops.wm.open_mainfile(filepath=str(SCENE), load_ui=False)
     yield 1.0
     space = area().spaces.active
-    space.show_region_ui, space.shading.type = True, "MATERIAL"
+    space.show_region_ui, space.shading.type = True, "SOLID"
     space.region_3d.view_rotation = (0.78, 0.42, 0.21, 0.41)
     space.region_3d.view_distance, space.region_3d.view_location = 8.0, (0.0, 0.0, 0.8)
     yield 1.5

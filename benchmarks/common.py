@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the benchmarks share: meshes, tables, and the checkout as a package. Run them from the repository's root."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # a script's own process, not Blender's
+
+from prt_addon.scene.object_mesh import ObjectMesh  # noqa: E402
+
+MESHES = ROOT.parent / "shared" / "data" / "meshes"
+
+
+def mesh_path(name: str) -> Path:
+    """The shared mesh, or the end of the program with a line that says it is absent."""
+    path = MESHES / name
+    if not path.exists():
+        print(f"skipped: {name} is not in the folder of shared meshes")
+        sys.exit(0)
+    return path
+
+
+def load_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Positions (v, 3) and triangles (t, 3) of an OBJ file of triangles."""
+    positions, triangles = [], []
+    for line in path.read_text().splitlines():
+        if line.startswith("v "):
+            positions.append([float(x) for x in line.split()[1:4]])
+        elif line.startswith("f "):
+            triangles.append([int(x.split("/")[0]) - 1 for x in line.split()[1:4]])
+    return np.array(positions), np.array(triangles, np.int32)
+
+
+def smooth_object(name: str, positions: NDArray[np.float64], triangles: NDArray[np.int32],
+                  albedo: tuple[float, float, float]) -> ObjectMesh:
+    """An ObjectMesh with area-weighted vertex normals."""
+    corners = positions[triangles]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(positions)
+    np.add.at(normals, triangles.ravel(), np.repeat(face, 3, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    colours = np.broadcast_to(np.asarray(albedo, np.float32), (len(triangles), 3, 3)).copy()
+    return ObjectMesh(name, positions, triangles, normals[triangles].astype(np.float32), colours, True)
+
+
+def drain(steps: Generator[Any, None, Any]) -> Any:
+    """Exhaust a generator and return its result."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+
+
+def best_of(runs: int, work: Callable[[], Any]) -> tuple[float, Any]:
+    """Least seconds of some runs, and the last result: the machines are shared, so the least is nearest the truth."""
+    least, result = float("inf"), None
+    for _ in range(runs):
+        started = time.perf_counter()
+        result = work()
+        least = min(least, time.perf_counter() - started)
+    return least, result
+
+
+def print_table(header: list[str], rows: list[list[Any]]) -> None:
+    """A Markdown table."""
+    print("| " + " | ".join(header) + " |")
+    print("|" + " --- |" * len(header))
+    for row in rows:
+        print("| " + " | ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) + " |")

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The whole chain against Cycles in the same Blender: read, trace, bounce, compress, relight; per-vertex radiance."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
+
+from prt_addon.baking.recipe import bake, exhaust
+from prt_addon.baking.settings import make_settings
+from prt_addon.blender.read_scene import read_objects
+from prt_addon.lighting.environment import project, world_rotation
+from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
+from prt_addon.scene.scene_mesh import SceneMesh
+
+# Cycles' own noise at these samples: two bakes with other seeds differ by sqrt(2) times it (asserted below).
+SAMPLES = 1024
+
+
+@pytest.fixture
+def still_life(scene):
+    """A smooth Suzanne over a floor whose vertices are close, with colours that bleed."""
+    bpy.ops.mesh.primitive_monkey_add(location=(0, 0, 1.0))
+    bpy.ops.object.shade_smooth()
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=24, y_subdivisions=24, size=4.0)
+    bpy.ops.object.shade_smooth()
+    for thing, colour in zip(bpy.data.objects, ((0.8, 0.25, 0.1, 1), (0.6, 0.7, 0.8, 1)), strict=True):
+        material = bpy.data.materials.new(thing.name)
+        if material.node_tree is None:
+            material.use_nodes = True
+        tree = material.node_tree
+        tree.nodes.clear()
+        diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
+        diffuse.inputs["Color"].default_value = colour
+        tree.links.new(diffuse.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs[0])
+        thing.data.materials.append(material)
+    use_cycles(SAMPLES)
+    return scene
+
+
+def baked(bounces):
+    objects = read_objects(bpy.context.evaluated_depsgraph_get(), [o.name for o in bpy.data.objects])
+    mesh = SceneMesh.assemble(objects, 0.0)
+    assert all(o.matches_source for o in mesh.objects)
+    settings = make_settings("high", {"bounces": str(bounces), "error_receivers": "0", "threads": "2"})
+    return exhaust(bake(mesh, settings)).objects
+
+
+def relit(container, image, degrees):
+    light = project(image, container.header["columns"]["order"], world_rotation(degrees))
+    constants = cluster_constants(container.bases, light)
+    return exit_radiance(container.cluster, container.weights, constants)[:, 0]
+
+
+def relative_rms(ours, theirs):
+    return float(np.sqrt(np.sum((ours - theirs) ** 2) / np.sum(theirs**2)))
+
+
+@pytest.mark.parametrize(("passes", "bounces", "limit"), [
+    ({"DIRECT"}, 0, 0.01), ({"DIRECT", "INDIRECT"}, -1, 0.015)])
+def test_radiance_of_a_smooth_environment(still_life, tmp_path, passes, bounces, limit):
+    image = smooth_environment()
+    containers = baked(bounces)
+    for degrees in (0.0, 130.0):
+        environment_world(image, degrees, tmp_path)
+        ours = np.concatenate([relit(containers[o.name], image, degrees) for o in bpy.data.objects])
+        theirs = [np.concatenate([vertex_radiance(o, passes, seed) for o in bpy.data.objects]) for seed in (0, 1)]
+        noise = relative_rms(*theirs) / np.sqrt(2.0)
+        assert noise < 0.01
+        truth = 0.5 * (theirs[0] + theirs[1])
+        error = relative_rms(ours, truth)
+        print(f"{sorted(passes)} at {degrees:g} degrees: relative RMS {error:.4f}, of it Cycles' noise {noise / 2**0.5:.4f}")
+        assert error < limit
+        # Orientation: any other turn fits far worse.
+        turned = np.concatenate([relit(containers[o.name], image, degrees + 90.0) for o in bpy.data.objects])
+        assert relative_rms(turned, truth) > 5 * limit
