@@ -22,8 +22,9 @@ lint:
 extension:
 	@python=$$(tools/environment.sh runtime) && "$$python" tools/fetch_wheels.py && "$$python" tools/build_extension.py
 
-interface: extension
-	@python=$$(tools/environment.sh test) && "$$python" -m pytest -c tests/pytest.ini tests/interface $(ARGS)
+interface: extension  # BLENDER defaults to the one on the PATH
+	@python=$$(tools/environment.sh runtime) && "$$python" tests/interface/run.py --zip build/extension/prt-*-linux-x64.zip \
+		--output build/interface --ui "$${BLENDER:-blender}" --headless "$${BLENDER:-blender} --background"
 
 clean:
 	rm -rf build .venv

@@ -9,7 +9,6 @@ from ..prt_addon.baking.settings import make_settings
 from . import live_preview
 from .bake_session import BakeSession, baked_message
 from .job_mixin import JobMixin
-from .properties import assign, session
 
 
 class PRT_OT_bake(JobMixin, bpy.types.Operator):
@@ -40,7 +39,6 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
     def finish_job(self, context: bpy.types.Context, job: BakeSession) -> str:
         result = job.store()
         job.discard()
-        assign(session(context), seconds=job.seconds)
         live_preview.bakes_changed()
         return baked_message(result, job.seconds)
 

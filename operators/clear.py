@@ -39,7 +39,7 @@ class PRT_OT_clear(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         text = f"Cleared the bake of {len(chosen)} object{'' if len(chosen) == 1 else 's'}"
-        assign(session(context), message=text, failed=False, seconds=-1.0)
+        assign(session(context), message=text, failed=False)
         live_preview.bakes_changed()
         self.report({"INFO"}, text)
         return {"FINISHED"}

@@ -109,7 +109,7 @@ class JobMixin:
             raise PRTError("Bake", "another bake is running", "Wait for its end, or cancel it")
         JobMixin.cancel_requested = False
         assign(session(context), running=True, stage="reading the scene", fraction=0.0, seconds_left=-1.0, message="",
-               failed=False)
+               failed=False, analysis="")
         JobMixin.running = self.start_job(context)
         return JobMixin.running
 

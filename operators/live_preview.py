@@ -163,7 +163,7 @@ def _read_light() -> None:
 
 def _schedule(wait: float) -> None:
     if not bpy.app.background and not bpy.app.timers.is_registered(_catch_up):
-        bpy.app.timers.register(_catch_up, first_interval=wait)
+        bpy.app.timers.register(_catch_up, first_interval=wait, persistent=True)
 
 
 def _catch_up() -> None:
@@ -172,6 +172,7 @@ def _catch_up() -> None:
     if not windows:
         return
     _live.working = True
+    assign(session(), preview=viewport.is_enabled())  # loading a file with its windows starts a new session
     try:
         with bpy.context.temp_override(window=windows[0]):
             if _live.bakes_dirty:

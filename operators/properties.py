@@ -77,7 +77,6 @@ class PRTSession(bpy.types.PropertyGroup):
     failed: BoolProperty()
     preview: BoolProperty()
     preview_message: StringProperty()
-    seconds: FloatProperty(default=-1.0)
     objects: CollectionProperty(type=PRTBakedObject)
     analysis: StringProperty()
 
@@ -88,10 +87,22 @@ def session(context: bpy.types.Context | None = None) -> PRTSession:
 
 
 def assign(owner: bpy.types.PropertyGroup, **values: object) -> None:
-    """Write properties that change: every write redraws all of Blender's windows."""
-    for name, value in values.items():
-        if getattr(owner, name) != value:
-            setattr(owner, name, value)
+    """Write properties that change, and have the sidebars drawn anew if any did."""
+    changed = {name: value for name, value in values.items() if getattr(owner, name) != value}
+    for name, value in changed.items():
+        setattr(owner, name, value)
+    if changed:
+        redraw_sidebars()
+
+
+def redraw_sidebars() -> None:
+    """Have the sidebar of every 3D viewport drawn anew: writing a session property alone does not."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                for region in area.regions:
+                    if region.type == "UI":
+                        region.tag_redraw()
 
 
 def register() -> None:

@@ -7,8 +7,9 @@ import textwrap
 
 import bpy
 
-CHARACTERS_PER_WIDTH = 0.135  # of the interface font at scale 1, per pixel of region width
+CHARACTERS_PER_WIDTH = 0.15  # of the interface font at scale 1, per pixel of region width
 MARGIN = 60  # pixels of a region that hold no text: icon, borders
+ROWS = 20  # of results: more make the sidebar slow and nobody reads them
 
 
 class _Sidebar:
@@ -78,17 +79,19 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
         if not session.objects:
             layout.label(text="Nothing is baked yet", icon="INFO")
             return
-        if session.seconds >= 0.0:
-            layout.label(text=f"Baked in {session.seconds:.1f} s", icon="TIME")
-        for line in session.objects:
-            box = layout.box()
-            box.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
-            if line.points:
-                box.label(text=f"{line.points:,} receivers, {line.clusters} clusters")
-            if line.error >= 0.0:
-                box.label(text=f"Error {100.0 * line.error:.2f} %")
+        column = layout.box().column(align=True)
+        for line in session.objects[:ROWS]:
+            row = column.row()
+            row.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
+            row.label(text=f"{line.points:,} receivers" if line.points else "not readable")
+            details = [f"{line.clusters} clusters"] * bool(line.clusters)
+            details += [f"error {100.0 * line.error:.2f} %"] * (line.error >= 0.0)
+            if details:
+                column.label(text=", ".join(details), icon="BLANK1")
             if line.stale:
-                _wrapped(box, context, line.stale, alert=True)
+                _wrapped(column, context, line.stale, "BLANK1", alert=True)
+        if len(session.objects) > ROWS:
+            column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
         layout.operator("prt.clear", icon="TRASH")
 
 

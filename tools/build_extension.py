@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from email import message_from_bytes
 from pathlib import Path
 
 from fetch_wheels import PYTHONS, ROOT, TAGS, Wheel, pinned_wheels, present
@@ -24,6 +23,13 @@ from fetch_wheels import PYTHONS, ROOT, TAGS, Wheel, pinned_wheels, present
 OUTPUT = ROOT / "build" / "extension"
 # The product. Everything else in the repository (tests, tools, benchmarks, requirements) stays out.
 FILES = ("__init__.py", "LICENSE", "README.md")
+# Licence of each wheel, and of the libraries inside that bring no text of their own; all may go with the GPL 3.
+LICENCES = {
+    "embreex": ("BSD-2-Clause", "Contains Intel Embree and oneTBB, under the Apache License 2.0 (below)."),
+    "OpenEXR": ("BSD-3-Clause", "Contains Imath (BSD-3-Clause) and libdeflate (MIT)."),
+    "scipy": ("BSD-3-Clause", "Contains OpenBLAS and the GCC runtime libraries; their texts are part of its own."),
+    "xatlas": ("MIT", "Contains the xatlas library (MIT)."),
+}
 FOLDERS = ("prt_addon", "operators", "panels", "gpu_shaders")
 
 
@@ -39,22 +45,20 @@ def blender_tool() -> Path:
 
 
 def notices(wheels: list[Wheel]) -> str:
-    """Names, versions and full licence texts of the bundled wheels, read from the wheels themselves."""
+    """Names, versions and full licence texts of the bundled wheels: their own, and of what lies inside without its text."""
     parts = ["# Third-party software in this extension", "", "The files in `wheels/` are unmodified. Their licences:"]
     for wheel in wheels:
         if wheel.python != PYTHONS[0]:
             continue
+        licence, inside = LICENCES[wheel.name]
+        parts += ["", f"## {wheel.name} {wheel.version}", "", f"Licence: {licence}. {inside}"]
         with zipfile.ZipFile(wheel.path) as archive:
-            names = archive.namelist()
-            metadata = message_from_bytes(archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))))
-            licence = metadata["License-Expression"] or (metadata["License"] or "").split("\n")[0].strip()
-            classifiers = [c.split("::")[-1].strip() for c in metadata.get_all("Classifier", []) if "License ::" in c]
-            texts = [n for n in names if ".dist-info/" in n and not n.endswith("/") and any(
-                word in Path(n).name.upper() for word in ("LICEN", "COPYING", "NOTICE"))]
-            parts += ["", f"## {wheel.name} {wheel.version}", "", f"Licence: {licence or ', '.join(classifiers)}"]
+            texts = [name for name in archive.namelist() if not name.endswith("/") and any(
+                word in Path(name).name.upper() for word in ("LICEN", "COPYING", "NOTICE"))]
             for text in texts:
-                parts += ["", "```text", archive.read(text).decode("utf-8").strip(), "```"]
-    return "\n".join(parts) + "\n"
+                parts += ["", f"`{text}`:", "", "```text", archive.read(text).decode("utf-8").strip(), "```"]
+    apache = (ROOT / "tools" / "licences" / "Apache-2.0.txt").read_text("utf-8").rstrip()
+    return "\n".join([*parts, "", "## Apache License 2.0", "", "```text", apache, "```", ""])
 
 
 def manifest(platform: str, wheels: list[Wheel]) -> str:

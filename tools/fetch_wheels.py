@@ -104,7 +104,8 @@ def fetch(platforms: list[str] | None) -> None:
 def write_lock() -> None:
     """Resolve the versions of requirements/runtime.in for every platform and Python, and pin the files found."""
     pins = dict(re.findall(r"^(\w+)==(\S+)$", (ROOT / "requirements" / "runtime.in").read_text("utf-8"), re.MULTILINE))
-    lines = ["# Written by `tools/fetch_wheels.py --lock`: the wheels inside the extension, by file."]
+    lines = ["# SPDX-License-Identifier: GPL-3.0-or-later",
+             "# Written by `tools/fetch_wheels.py --lock`: the wheels inside the extension, by file."]
     for platform in TAGS:
         for python in PYTHONS:
             for name in PACKAGES:

@@ -29,7 +29,7 @@ from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
 from ..storage.files import load_arrays, save_arrays
 from ..tracing.tracer import Tracer
-from ..transport.direct import direct_transfer, unshadowed_transfer
+from ..transport.direct import direct_transfer
 from ..transport.gather import Gather, gather_operator
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
@@ -177,11 +177,9 @@ class _Bake:
         stored = self._load("direct")
         if stored is not None:
             return receivers, stored[0]["transfer"]
-        if self.plan.needs.shadow_rays:
-            transfer = yield from self._follow("direct", direct_transfer(
-                self.tracer, receivers, *self.directions, order, self.settings.rotation_group, self.settings.seed))
-        else:
-            transfer = unshadowed_transfer(receivers.normals, order).astype(np.float32)
+        transfer = yield from self._follow("direct", direct_transfer(
+            self.tracer, receivers, *self.directions, order, self.settings.rotation_group, self.settings.seed,
+            self.plan.needs.shadow_rays))
         self._save("direct", {"transfer": transfer})
         return receivers, transfer
 
@@ -306,7 +304,7 @@ def _unpack_gather(scene: SceneMesh, tracer: Tracer, arrays: dict[str, NDArray],
     place = np.empty(len(key), np.int64)
     order = np.argsort(made.key)
     place[np.argsort(key)] = order
-    receivers = ReceiverSet(made.key[place], made.origins[place], made.normals[place])
+    receivers = made.taken(place)
     size = (len(key), len(key))
     matrix = sparse.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=size)
     return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS))

@@ -23,7 +23,7 @@ TEMPORARY = "PRT temporary"
 
 @contextmanager
 def scratch_scene(like: bpy.types.Scene) -> Iterator[bpy.types.Scene]:
-    """An empty scene at the frame of `like`, rendered by Cycles on the CPU with one sample. Raises PRTError without Cycles."""
+    """An empty scene at the frame of `like` for Cycles on the CPU, one sample. Raises PRTError without Cycles."""
     if not hasattr(like, "cycles"):
         raise PRTError("Cycles", "it is switched off, and node trees are evaluated with it",
                        "Enable the Cycles Render Engine in Preferences, Add-ons")

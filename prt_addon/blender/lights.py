@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""All light that an environment bake can show, as one set of coefficients: the World, or a file in its place, and Suns."""
+"""The light that an environment bake can show, as one set of coefficients: the World or a file, and Suns."""
 
 from __future__ import annotations
 

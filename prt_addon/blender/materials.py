@@ -2,9 +2,9 @@
 """Diffuse albedo of any material: plain colours are read, every other node tree is evaluated by Cycles.
 
 Albedo here means what Cycles' diffuse colour pass reports once dielectric reflection, coat and sheen are switched off:
-base colour x (1 - metallic) x (1 - transmission) x alpha of a Principled BSDF. With reflection on, that pass drops by the
-few percent that go into the highlight, by an amount that depends on the view; transfer has no view, and the light is
-not lost but reflected.
+base colour x (1 - metallic) x (1 - transmission) x alpha of a Principled BSDF. With reflection on, that pass drops by
+the few percent that go into the highlight, by an amount that depends on the view; transfer has no view, and the light
+is not lost but reflected.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _clipped(colour: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def material_digest(materials: list[bpy.types.Material | None]) -> str:
-    """Text that changes when a material of the list, or a value or link in one, changes (not when pixels of an image do)."""
+    """Text that changes when a material of the list, or a value or link in one, changes. Pixels of images do not."""
     trees = [None if m is None else (signature(m.node_tree) if m.node_tree else tuple(m.diffuse_color))
              for m in materials]
     return hashlib.blake2b(repr(trees).encode(), digest_size=16).hexdigest()
@@ -103,7 +103,7 @@ class AlbedoReader:
     def add(self, evaluated: bpy.types.Object, generated_mesh: bpy.types.Mesh | None,
             depsgraph: bpy.types.Depsgraph, arrays: MeshArrays, materials: list[bpy.types.Material | None],
             matrix: NDArray[np.float64], result: NDArray[np.float32]) -> None:
-        """Fill result (t, 3, 3) float32 now or in `evaluate`. generated_mesh: of nodes, in place of the object's own."""
+        """Fill result (t, 3, 3) float32 now or in `evaluate`. generated_mesh: made by nodes, not the object's own."""
         slots: list[bpy.types.Material | None] = list(materials) or [None]
         # A face whose index exceeds the slots shows the last one, as in Cycles.
         slot = np.clip(arrays.material_index, 0, len(slots) - 1)

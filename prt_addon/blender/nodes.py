@@ -93,7 +93,7 @@ def _struct_signature(struct: bpy.types.bpy_struct, depth: int) -> Hashable:
         return struct.name_full
     parts = []
     for item in struct.bl_rna.properties:
-        if item.identifier in IGNORED or item.is_hidden and item.type not in PLAIN:
+        if item.identifier in IGNORED or (item.is_hidden and item.type not in PLAIN):
             continue
         value = getattr(struct, item.identifier)
         if item.type in PLAIN:

@@ -19,8 +19,9 @@ from ..scene.scene_mesh import ObjectMesh
 from .materials import AlbedoReader
 from .visibility import find_objects, shown_as_in_render
 
-UNSUPPORTED = {"VOLUME": "volume", "POINTCLOUD": "point cloud", "CURVES": "hair curves", "GREASEPENCIL": "grease pencil"}
-# Least over largest singular value of a target's transform below which its local space has no way back from world space.
+UNSUPPORTED = {"VOLUME": "volume", "POINTCLOUD": "point cloud", "CURVES": "hair curves",
+               "GREASEPENCIL": "grease pencil"}
+# Determinant, relative to the largest entry cubed, below which a transform has no way back from world to local space.
 FLAT = 1e-9
 
 

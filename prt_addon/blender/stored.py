@@ -37,7 +37,8 @@ def write_baked(scene_object: bpy.types.Object, baked: BakedTransfer, digests: d
     where Blender can't store data for this object; its previous bake then stays.
     """
     if scene_object.library is not None or scene_object.override_library is not None:
-        raise StorageError(scene_object.name, "it is linked from another file", "Make it local, or bake it in that file")
+        raise StorageError(scene_object.name, "it is linked from another file",
+                           "Make it local, or bake it in that file")
     matrix = _bake_matrix(baked, scene_object)
     if is_flattened(matrix):
         raise StorageError(scene_object.name, "its scale is zero along an axis", "Give it a scale and bake it again")
@@ -199,7 +200,8 @@ def _fits_source(scene_object: bpy.types.Object, baked: BakedTransfer) -> bool:
     mesh = scene_object.data
     return (bool(baked.header.get("source", {}).get("on_source_mesh"))
             and isinstance(mesh, bpy.types.Mesh) and mesh.library is None and mesh.users == 1
-            and mesh.shape_keys is None and not mesh.is_editmode and not scene_object.modifiers and not scene_object.is_instancer
+            and mesh.shape_keys is None and not mesh.is_editmode
+            and not scene_object.modifiers and not scene_object.is_instancer
             and len(mesh.vertices) == len(baked.cluster))
 
 

@@ -14,7 +14,7 @@ from ..errors import BadScene
 def render_visible_objects(view_layer: bpy.types.ViewLayer) -> dict[str, bpy.types.Object]:
     """Original objects that renders of this view layer show, by full name, in the file's order.
 
-    Neither the object nor, on at least one way down the tree of collections, any collection may be disabled for renders.
+    The object is not disabled for renders, nor, on at least one way down the tree of collections, is any collection.
     """
     visible: dict[str, bpy.types.Object] = {}
     pending = [view_layer.layer_collection]

@@ -214,6 +214,9 @@ def _check_images(world: bpy.types.World, output: bpy.types.Node) -> None:
         if image.source == "FILE" and image.packed_file is None and not os.path.isfile(_path_of(image)):
             raise PRTError(_path_of(image) or image.name, f"the image of World {world.name} does not exist",
                            CHOOSE_IMAGE)
+        if image.source == "FILE" and 0 in tuple(image.size):
+            raise PRTError(_path_of(image) or image.name, f"Blender can't read the image of World {world.name}",
+                           CHOOSE_IMAGE)
 
 
 def _path_of(image: bpy.types.Image) -> str:
@@ -231,11 +234,8 @@ def _image_key(image: bpy.types.Image) -> Hashable:
 
 
 def _image_pixels(image: bpy.types.Image) -> NDArray[np.float32]:
-    """(height, width, 3) float32 linear, top row first. Raises PRTError where Blender can't read the image."""
+    """(height, width, 3) float32 linear, top row first. Raises PRTError for values that are not finite."""
     width, height = image.size
-    if not width or not height:
-        raise PRTError(_path_of(image) or image.name, "Blender can't read this image", CHOOSE_IMAGE)
-    # Blender fills a buffer of this size only as a whole: four channels, or as many as the file has.
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(height, width, image.channels)[::-1, :, :3]

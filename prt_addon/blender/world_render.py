@@ -8,6 +8,8 @@ a lot, pixels are sampled again on a fine grid and averaged, so that the sun of 
 
 from __future__ import annotations
 
+import math
+
 import bpy
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +19,13 @@ from .cycles_bake import TEMPORARY, evaluate_corners, scratch_scene
 from .nodes import copy_groups
 
 SMALLEST_WIDTH, LARGEST_WIDTH = 1024, 4096
+# A sky texture's sun must not slip between pixels. Its disc gives the same light at any size.
+SMALLEST_SUN = math.radians(0.545)
 AT_ONCE = 1 << 20  # directions per bake: about 200 MB in Blender
-CONTRAST = 0.25  # pixels that differ from a neighbour by more than this share of the larger value are refined,
-SHARE = 1e-6  # if they could hold more than this share of all light,
-REFINED = 20_000  # the brightest first, at most this many,
-STEPS = 8  # each sampled on a grid of this many by this many places
+# A pixel that can differ from a neighbour by more than `share` of all light is sampled again, with its neighbours, on a
+# grid of `steps` by `steps` places; where more ask for it, the `most` with most at stake. The first line serves edges
+# and bright windows, the second the rim of a sun that covers two pixels.
+REFINEMENTS = ({"share": 1e-5, "most": 4096, "steps": 8}, {"share": 1e-3, "most": 64, "steps": 40})
 # What a Light Path node says to a diffuse surface that looks for light; all other outputs are zero.
 SEEN_BY_DIFFUSE = {"Is Diffuse Ray": 1.0, "Is Reflection Ray": 1.0, "Ray Depth": 1.0, "Diffuse Depth": 1.0,
                    "Ray Length": 1e10}
@@ -38,7 +42,7 @@ def render_world(scene: bpy.types.Scene, world: bpy.types.World, image_width: in
     copy = world.copy()
     groups: list[bpy.types.NodeTree] = []
     try:
-        copy_groups(copy.node_tree, _answer_as_diffuse, groups)
+        copy_groups(copy.node_tree, _prepare, groups)
         with scratch_scene(scene) as scratch:
             scratch.world = copy
             rows, columns = np.divmod(np.arange(height * width), width)
@@ -51,11 +55,14 @@ def render_world(scene: bpy.types.Scene, world: bpy.types.World, image_width: in
     return image
 
 
-def _answer_as_diffuse(tree: bpy.types.NodeTree) -> None:
-    """Replace Light Path nodes of a tree of ours by what they would say to diffuse surfaces.
+def _prepare(tree: bpy.types.NodeTree) -> None:
+    """Replace Light Path nodes of a tree of ours by what they would say to diffuse surfaces, and widen small suns.
 
-    Artists use them to show the camera another background than the one that lights the scene.
+    Artists use Light Path to show the camera another background than the one that lights the scene.
     """
+    for node in tree.nodes:
+        if node.bl_idname == "ShaderNodeTexSky":
+            node.sun_size = max(node.sun_size, SMALLEST_SUN)
     for node in [n for n in tree.nodes if n.bl_idname == "ShaderNodeLightPath"]:
         for socket in node.outputs:
             targets = [link.to_socket for link in socket.links]
@@ -68,27 +75,48 @@ def _answer_as_diffuse(tree: bpy.types.NodeTree) -> None:
 
 
 def _refine(scratch: bpy.types.Scene, image: NDArray[np.float32]) -> None:
-    """Average pixels that differ from their neighbours over a grid of places inside them, in place."""
+    """Average pixels that differ from their neighbours over a grid of places inside them; changes the image.
+
+    All in one evaluation, because Cycles prepares a sky texture anew for each.
+    """
     height, width = image.shape[:2]
-    value = image.max(axis=2)
-    solid_angle = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None]
-    largest, smallest = value.copy(), value.copy()
-    for neighbour in (np.roll(value, 1, axis=1), np.roll(value, -1, axis=1),
-                      np.concatenate([value[:1], value[:-1]]), np.concatenate([value[1:], value[-1:]])):
-        np.maximum(largest, neighbour, out=largest)
-        np.minimum(smallest, neighbour, out=smallest)
-    light = largest * solid_angle
-    chosen = (largest - smallest > CONTRAST * largest) & (light > SHARE * np.sum(value * solid_angle, dtype=np.float64))
-    index = np.flatnonzero(chosen)
-    if len(index) > REFINED:
-        index = index[np.argsort(light.ravel()[index], kind="stable")[-REFINED:]]
-    if not len(index):
+    steps = _steps_per_pixel(image)
+    rows, columns, owners = [], [], []
+    for count in np.unique(steps[steps > 0]):
+        row, column = np.nonzero(steps == count)
+        places = (np.arange(count) + 0.5) / count - 0.5
+        rows.append((row[:, None] + np.repeat(places, count)).ravel())
+        columns.append((column[:, None] + np.tile(places, count)).ravel())
+        owners.append(np.repeat(row * width + column, count * count))
+    if not owners:
         return
-    rows, columns = np.divmod(index, width)
-    steps = (np.arange(STEPS) + 0.5) / STEPS - 0.5
-    down, right = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
-    fine = _evaluate(scratch, (rows[:, None] + down).ravel(), (columns[:, None] + right).ravel(), height, width)
-    image[rows, columns] = fine.reshape(len(index), -1, 3).mean(axis=1)
+    fine = _evaluate(scratch, np.concatenate(rows), np.concatenate(columns), height, width)
+    pixels, owner = np.unique(np.concatenate(owners), return_inverse=True)
+    members = np.bincount(owner)
+    for channel in range(3):
+        image.reshape(-1, 3)[pixels, channel] = np.bincount(owner, weights=fine[:, channel]) / members
+
+
+def _steps_per_pixel(image: NDArray[np.float32]) -> NDArray[np.int64]:
+    """How finely each pixel (height, width) has to be sampled again; 0 where once was enough."""
+    value = image.max(axis=2)
+    solid_angle = np.sin(np.pi * (np.arange(len(image)) + 0.5) / len(image))[:, None]
+    stake = np.maximum.reduce([np.abs(n - value) for n in _neighbours(value)]) * solid_angle
+    total = np.sum(value * solid_angle, dtype=np.float64)
+    steps = np.zeros(value.shape, np.int64)
+    for refinement in REFINEMENTS:
+        chosen = stake > refinement["share"] * total
+        if chosen.sum() > refinement["most"]:
+            chosen &= stake >= np.partition(stake.ravel(), -refinement["most"])[-refinement["most"]]
+        # With the neighbours: what is smoothed out of one pixel must arrive in the next.
+        steps[np.logical_or.reduce([chosen, *_neighbours(chosen)])] = refinement["steps"]
+    return steps
+
+
+def _neighbours(values: NDArray) -> list[NDArray]:
+    """The values (height, width) to the right, left, below and above; the rows at the poles are their own."""
+    return [np.roll(values, 1, axis=1), np.roll(values, -1, axis=1), np.concatenate([values[:1], values[:-1]]),
+            np.concatenate([values[1:], values[-1:]])]
 
 
 def _evaluate(scratch: bpy.types.Scene, rows: NDArray, columns: NDArray, height: int,

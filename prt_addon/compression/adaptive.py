@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .clustered_pca import Report, converge
+from .clustered_pca import Report
 from .global_frame import GlobalFrame
 from .reclassify import reclassify
 from .settings import EncoderSettings

@@ -30,13 +30,14 @@ def static_labels(frame: GlobalFrame, settings: EncoderSettings) -> NDArray[np.i
     return lbg(data, random_means(data, settings.clusters, generator), settings.iterations)
 
 
-def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float) -> Subspaces:
+def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float,
+                seed_vectors: int = SEED_VECTORS) -> Subspaces:
     """Subspaces from best-first splits.
 
     With a target, splits are judged with all vectors and end where the target is met, so that a simple signal gets few
-    clusters; otherwise with SEED_VECTORS.
+    clusters; otherwise with seed_vectors.
     """
-    vectors = settings.vectors if settings.target_error is not None else min(SEED_VECTORS, settings.vectors)
+    vectors = settings.vectors if settings.target_error is not None else min(seed_vectors, settings.vectors)
     if settings.target_error is not None:
         width = frame.leading(TRUNCATION * enough)
         labels = split_seeds(frame.coordinates, settings.clusters, vectors, enough - frame.tail[width], lambda _: width)

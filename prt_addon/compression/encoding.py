@@ -5,22 +5,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply
 from .adaptive import adapt, trim_vectors
-from .clustered_pca import iterate, random_start, split_start, static_labels
+from .clustered_pca import SEED_VECTORS, iterate, random_start, split_start, static_labels
 from .global_frame import GlobalFrame, global_frame
 from .pca import principal_components
 from .settings import EncoderSettings
+from .subspaces import Subspaces
 
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
 ROUNDING = 1e-12
 # Signals of at most so many values times clusters get this many random starts beside the splits.
-SMALL, SMALL_STARTS = 1 << 20, 3
+SMALL, SMALL_STARTS = 1 << 19, 8
 CHUNK = 4096
 
 Progress = Callable[[float], None]
@@ -117,29 +119,43 @@ def _classify(frame: GlobalFrame, settings: EncoderSettings,
         return labels, np.full(int(labels.max()) + 1, settings.vectors)
     enough = _enough(frame, settings)
     share = 0.6 if settings.method == "adaptive" else 1.0
-    state = split_start(frame, settings, enough)
-    states = [state]
-    if settings.target_error is None:
-        states += [random_start(frame, settings, number) for number in range(_restarts(frame, settings))]
-    errors = []
-    for number, state in enumerate(states):
-        def report_part(stage: str, error: float, fraction: float, number: int = number) -> None:
-            report(stage, error, (number + fraction) / len(states) * share)
-        errors.append(iterate(frame, state, settings, enough, report_part))
-    state = states[int(np.argmin(errors))]
+    state = _best_start(frame, settings, enough, lambda stage, error, part: report(stage, error, share * part))
     if settings.method == "adaptive":
         adapt(frame, state, settings, lambda stage, error, part: report(stage, error, share + (1 - share) * part))
     return state.labels, state.vectors
 
 
-def _restarts(frame: GlobalFrame, settings: EncoderSettings) -> int:
-    """How many of the paper's random starts are tried beside the splits: some where the signal is small."""
-    if settings.restarts is not None:
-        return settings.restarts
-    return SMALL_STARTS if frame.coordinates.size * settings.clusters <= SMALL else 0
+def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float,
+                report: Callable[[str, float, float], None]) -> Subspaces:
+    """Iterative clustered PCA from one or more starts; the lowest squared error wins, the splits among equals.
+
+    The iteration ends in a local minimum that depends on the start by some 10 % where clusters are few, and small
+    signals cost nothing, so they get several starts and more patience.
+    """
+    restarts = settings.restarts
+    if restarts is None:
+        restarts = SMALL_STARTS if frame.coordinates.size * settings.clusters <= SMALL else 0
+    if restarts == 0 or settings.target_error is not None:
+        state = split_start(frame, settings, enough)
+        iterate(frame, state, settings, enough, report)
+        return state
+    patient = replace(settings, tolerance=settings.tolerance / 10)
+    starts = [partial(split_start, frame, patient, enough, seed_vectors) for seed_vectors in (SEED_VECTORS, 0)]
+    starts += [partial(random_start, frame, patient, number) for number in range(restarts)]
+    best, lowest = None, np.inf
+    for number, start in enumerate(starts):
+        state = start()
+
+        def report_part(stage: str, error: float, fraction: float, number: int = number, least: float = lowest) -> None:
+            report(f"start {number}, {stage}", min(error, least), (number + fraction) / len(starts))
+        error = iterate(frame, state, patient, enough, report_part)
+        if best is None or error < lowest:
+            best, lowest = state, error
+    return best
 
 
-def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64], enough: float | None) -> Encoding:
+def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64],
+            enough: float | None) -> Encoding:
     """Exact PCA of every cluster on all values, then back to the signal's own values.
 
     enough: squared error up to which the least useful vectors are left out again; None keeps all.

@@ -65,7 +65,7 @@ def metric_roots(metric: NDArray | None, values: int) -> tuple[NDArray, NDArray]
         return np.eye(values), np.eye(values)
     metric = np.asarray(metric, np.float64)
     rows = metric.shape[0]
-    if metric.shape != (rows, rows) or values % rows or not np.allclose(metric, metric.T, atol=1e-12 * abs(metric).max()):
+    if metric.shape != (rows, rows) or values % rows or not np.allclose(metric, metric.T, atol=1e-12 * metric.max()):
         raise PRTError("metric", f"shape {metric.shape} is no symmetric matrix over {values} values", "Pass (m, m)")
     eigenvalues, vectors = symmetric_eigenpairs(metric)
     if not eigenvalues[0] > 0 or eigenvalues[-1] < -1e-9 * eigenvalues[0]:

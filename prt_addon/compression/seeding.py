@@ -14,10 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..linear_algebra import multiply, row_squares
 from .subspaces import SPARE, Fit, Single, fit_subspace, squared_distances
 
 # Alternations of fitting both halves and reassigning their points.
 ROUNDS = 4
+# Share of the scatter below which an error in single precision is rounding.
+CANCELLATION = 1e-4
 
 
 @dataclass(order=True)
@@ -52,9 +55,18 @@ def split_points(points: Single, whole: Fit, vectors: int) -> tuple[NDArray[np.b
     return side, fit_subspace(points[~side], fits[0].basis), fit_subspace(points[side], fits[1].basis)
 
 
-def fit_error(fit: Fit, vectors: int) -> float:
-    """Squared error of a fit that uses its leading vectors."""
-    return max(float(fit.squares.sum(dtype=np.float64) - fit.spread[:vectors].sum()), 0.0)
+def fit_error(points: Single, fit: Fit, vectors: int) -> float:
+    """Squared error of a fit to points (m, d) that uses its leading vectors.
+
+    The difference of scatter and D_i^2 is rounding alone where nearly everything is explained (points of very different
+    scale); only then are the residuals themselves formed.
+    """
+    scatter = fit.squares.sum(dtype=np.float64)
+    error = float(scatter - fit.spread[:vectors].sum())
+    if error > CANCELLATION * scatter:
+        return error
+    residuals = points - fit.mean - multiply(fit.weights[:, :vectors], fit.basis[:vectors])
+    return float(row_squares(residuals).sum(dtype=np.float64))
 
 
 def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width: Callable[[float], int]) \
@@ -68,7 +80,7 @@ def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width:
     for _ in range(3):
         fit = fit_subspace(data[:, :leading], basis)
         basis = fit.basis
-    error = fit_error(fit, vectors)
+    error = fit_error(data[:, :leading], fit, vectors)
     queue = [_Leaf(-error, 0, np.arange(len(data)), basis, error)]
     done: list[_Leaf] = []
     made = 1
@@ -96,16 +108,16 @@ def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width:
 
 
 def _judge(data: Single, leaf: _Leaf, vectors: int, number: int) -> None:
-    """Try to split a leaf: fills its halves and its key, or leaves halves None; its error becomes that in data's values."""
+    """Try to split a leaf: fills its halves and key, or leaves halves None. Its error becomes that in these data."""
     basis = np.pad(leaf.basis, ((0, 0), (0, data.shape[1] - leaf.basis.shape[1])))
     points = data[leaf.members]
     whole = fit_subspace(points, basis)
-    leaf.error = fit_error(whole, vectors)
+    leaf.error = fit_error(points, whole, vectors)
     split = split_points(points, whole, vectors)
     if split is None:
         return
     side, left, right = split
-    errors = fit_error(left, vectors), fit_error(right, vectors)
+    errors = fit_error(points[~side], left, vectors), fit_error(points[side], right, vectors)
     leaf.halves = (_Leaf(-errors[0], number, leaf.members[~side], left.basis, errors[0]),
                    _Leaf(-errors[1], number, leaf.members[side], right.basis, errors[1]))
     leaf.key = sum(errors) - leaf.error

@@ -23,7 +23,8 @@ class EncoderSettings:
         and vector. The error reached is at most this wherever the clusters and vectors allowed suffice.
     vectors_limit: most vectors of one cluster in the adaptive method; None allows twice `vectors`.
     tolerance: relative decrease of the squared error below which iterations stop.
-    restarts: how many of the paper's random starts to try beside the splits; None lets the signal's size decide.
+    restarts: how many of the paper's random starts to try beside the splits; None lets the signal's size decide, and a
+        target_error makes do with the splits.
     """
 
     clusters: int = 256
@@ -33,7 +34,7 @@ class EncoderSettings:
     iterations: int = 20
     target_error: float | None = None
     vectors_limit: int | None = None
-    tolerance: float = 0.01
+    tolerance: float = 0.005
     restarts: int | None = None
 
     def __post_init__(self) -> None:

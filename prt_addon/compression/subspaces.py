@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Affine subspaces, one per cluster, and their warm update by one block power step and a Rayleigh-Ritz problem.
 
-Kambhatla and Leen's local PCA needs the leading eigenvectors of each cluster's covariance after every classification. As
-clusters change little between classifications, one step of block power iteration from the last vectors (W = C B^T,
+Kambhatla and Leen's local PCA needs the leading eigenvectors of each cluster's covariance after every classification.
+As clusters change little between classifications, one step of block power iteration from the last vectors (W = C B^T,
 Z = C^T W) follows them without ever forming an n x n matrix; a Rayleigh-Ritz problem of the block's size orders them.
 """
 
@@ -102,7 +102,7 @@ def fit_subspace(points: Single, start: Single) -> Fit:
     """Fit an affine subspace to points (m, d) by one power step and Rayleigh-Ritz from the rows of start (q, d).
 
     The rows Z of one power step are scaled to unit length; the subspace's best vectors then solve
-    (C Z^T)^T (C Z^T) v = D^2 (Z Z^T) v, C the centred points: orthonormalization and Rayleigh-Ritz in one small problem.
+    (C Z^T)^T (C Z^T) v = D^2 (Z Z^T) v, C the centred points: orthonormalization and Rayleigh-Ritz in one problem.
     Rows of start that are zero are first replaced by differences of the points farthest from the subspace, so that a
     block grows into directions that it has not seen.
     """

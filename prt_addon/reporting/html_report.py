@@ -89,9 +89,9 @@ def _attention(report: Report) -> str:
     hints = [str(hint) for hint in report.get("hints", [])]
     if not lines and not hints:
         return ""
-    title = "Worth a look" if lines else "Hints"
+    failed = bool(_failed(report))
     items = "".join(f"<li>{escape(line)}</li>" for line in [*lines, *hints])
-    return _section(title, f"<ul>{items}</ul>", style="attention" if lines else "")
+    return _section("Needs a look" if failed else "Notes", f"<ul>{items}</ul>", style="attention" if failed else "")
 
 
 def _times(report: Report) -> str:
@@ -131,7 +131,7 @@ def _errors(report: Report) -> str:
     measured = (f"Measured at {plural(largest['receivers'], 'random point', 'random points')} with "
                 f"{count(largest['reference_rays'])} independent rays. Dot: measured value; line: its 95 % interval.")
     metric = report.get("error_metric")
-    metric_line = f'<p class="why">Each number: {escape(str(metric))}.</p>' if metric else ""
+    metric_line = f'<p class="why below">Each number: {escape(str(metric))}.</p>' if metric else ""
     plot = svg_plots.intervals(rows, wording.ZONES, "Relative error by cause with 95 % intervals")
     return _section("How right is the picture?", f'<p class="why">{escape(measured)}</p>', plot,
                     f"<dl>{''.join(words)}</dl>", metric_line)
@@ -141,7 +141,7 @@ def _left_out(report: Report) -> str:
     rows = [[escape(str(entry[key])) for key in ("what", "why", "saved")] for entry in report["left_out"]]
     if not rows:
         return _section("What was left out", "<p>Nothing: this scene needs every step of the bake.</p>")
-    intro = '<p class="why">Work this scene does not need. Leaving it out does not change the picture.</p>'
+    intro = '<p class="why">Work this scene does not need. Leaving it out makes no visible difference.</p>'
     return _section("What was left out", intro, _table((("What", False), ("Why", False), ("Saved", False)), rows))
 
 
@@ -154,7 +154,7 @@ def _compression(report: Report) -> str:
              f"vectors on average, total squared error {number(clusters['squared_error'])}, "
              f"overdraw {number(clusters['overdraw'])}.</p>")
     rows = [[escape(name), count(o.get("receivers")), count(o.get("count")), number(o.get("vectors_mean")),
-             "unknown" if o.get("relative_error") is None else percent(o["relative_error"]), number(o.get("overdraw"))]
+             "unknown" if o.get("relative_error") is None else percent(_relative_rms(o)), number(o.get("overdraw"))]
             for name, o in objects.items()]
     numbers = [(name, True) for name in ("Points", "Clusters", "Vectors", "Error", "Overdraw")]
     table = _table([("Object", False), *numbers], rows) if rows else ""
@@ -171,11 +171,16 @@ def _short(name: str) -> str:
     return name if len(name) <= 20 else f"{name[:19]}\u2026"
 
 
+def _relative_rms(encoded: dict[str, Any]) -> float:
+    """The encoder's relative error is of squares (compression.encoding); a person reads its root."""
+    return math.sqrt(max(encoded.get("relative_error") or 0.0, 0.0))
+
+
 def _history(encoded: dict[str, Any]) -> list[tuple[float, float]]:
     """(seconds, relative error): the recorded squared errors, scaled so that the last is the final relative error."""
     entries = [entry for entry in encoded.get("history") or [] if None not in entry]
     final = entries[-1][2] if entries else 0.0
-    relative = encoded.get("relative_error") or 0.0
+    relative = _relative_rms(encoded)
     if final <= 0.0 or relative <= 0.0:
         return []
     return [(float(at), relative * math.sqrt(max(squared, 0.0) / final)) for at, _, squared in entries]

@@ -75,7 +75,7 @@ class _LogAxis:
 
 def percent(value: float) -> str:
     """A share as a short percentage: 0.0123 -> "1.2 %"."""
-    scaled = 100.0 * value
+    scaled = float(f"{100.0 * value:.2g}") if value < 1.0 else 100.0 * value
     digits = 0 if scaled == 0.0 else max(0, min(6, 1 - math.floor(math.log10(abs(scaled)))))
     return f"{scaled:.{digits}f} %"
 

@@ -14,6 +14,8 @@ PULL = 0.01
 LIFT = 1e-6
 # Faces steeper than this against the shading normal can't be cleared by moving along it.
 STEEPEST = 0.1
+# Faces at a point that are told apart; the pole of a fine sphere has hundreds that hardly differ.
+MOST_FACES = 12
 # The lift may not carry a receiver further than this fraction of the distance to its faces' middle.
 HIGHEST = 0.25
 
@@ -49,6 +51,36 @@ def ray_origins(points: NDArray[np.float64], normals: NDArray[np.float64], trian
     reach = np.sqrt(np.sum(shift ** 2, axis=1)) * (HIGHEST / PULL)
     height = np.minimum(height, np.maximum(reach, lift))
     return points + shift + height[:, None] * upward
+
+
+def adjacent_faces(points: NDArray[np.float64], triangles: NDArray[np.int32],
+                   ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unit normals (p, k, 3) of each point's faces and their weights (p, k) by angle, of sum 1 (0: no face).
+
+    k is the largest number of faces at a point, at most MOST_FACES; of more, evenly spaced ones stand for all. By
+    angle, because a quad must count the same whichever way it was cut.
+    """
+    corners = points[triangles]
+    edges = np.roll(corners, -1, axis=1) - corners
+    edges /= np.maximum(np.sqrt(np.sum(edges ** 2, axis=2, keepdims=True)), np.finfo(np.float64).tiny)
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
+    angle = np.arccos(np.clip(-np.sum(edges * np.roll(edges, 1, axis=1), axis=2), -1.0, 1.0)).ravel()
+    owner = triangles.ravel()
+    order = np.argsort(owner, kind="stable")
+    degree = np.bincount(owner, minlength=len(points))
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(degree) - degree, degree)
+    number = np.minimum(degree, MOST_FACES)[owner[order]]
+    slot = rank * number // np.maximum(degree[owner[order]], 1)
+    first = (rank == 0) | (slot != (rank - 1) * number // np.maximum(degree[owner[order]], 1))
+    width = int(min(degree.max(initial=1), MOST_FACES))
+    normals = np.zeros((len(points), width, 3), np.float32)
+    weights = np.zeros((len(points), width), np.float32)
+    place = owner[order][first], slot[first]
+    normals[place] = face[order[first] // 3]
+    weights[place] = angle[order[first]]
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    return normals, weights
 
 
 def morton_order(points: NDArray[np.floating]) -> NDArray[np.int64]:

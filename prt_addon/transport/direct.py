@@ -38,10 +38,11 @@ def unshadowed_transfer(normals: NDArray[np.float64], order: int) -> NDArray[np.
 
 def direct_transfer(tracer: Tracer, receivers: ReceiverSet, directions: NDArray[np.float64],
                     weights: NDArray[np.float64], order: int, group: int = 0, seed: int = 0,
-                    ) -> Generator[float, None, NDArray[np.float32]]:
+                    shadow_rays: bool = True) -> Generator[float, None, NDArray[np.float32]]:
     """Yield progress, return transfer (r, order^2) float32 of the receivers in their order.
 
-    directions (d, 3), weights (d,): a quadrature of the sphere. group: see `blocks`.
+    directions (d, 3), weights (d,): a quadrature of the sphere. group: see `blocks`. shadow_rays: False where nothing
+    can be hit (a lone convex mesh): only the faces' own horizons count then.
     The quadrature's own error on the unshadowed cosine is known exactly, so it is taken out in proportion to what the
     receiver sees (a control variate): an open receiver is exact at any number of directions.
     """
@@ -52,7 +53,7 @@ def direct_transfer(tracer: Tracer, receivers: ReceiverSet, directions: NDArray[
     done = 0
 
     def trace(task: _Task) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        return _cosine_visibility(tracer, receivers, task.block.receivers, task.directions)
+        return _cosine_visibility(tracer if shadow_rays else None, receivers, task.block.receivers, task.directions)
 
     for task, (cosines, visible, rays) in tracer.map_in_order(trace, tasks):
         place = task.block.receivers
@@ -76,15 +77,22 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
                         np.ascontiguousarray(basis[:, chunk]), start + CHUNK >= len(directions))
 
 
-def _cosine_visibility(tracer: Tracer, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
+def _cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
                        ) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
-    """Clamped cosines (d, b), the same where nothing is hit, and the number of rays."""
+    """Clamped cosines (d, b), the same weighted by what is seen, and the number of rays.
+
+    tracer: None where nothing can be hit.
+    """
     cosines = facing_cosines(directions, receivers.normals[place])
     visible = cosines.copy()
-    origins = receivers.origins[place]
+    origins, grazing = receivers.origins[place], receivers.grazing[place]
     rays = 0
     for index, direction in enumerate(directions):
-        facing = np.flatnonzero(cosines[index] > 0.0)
+        low = np.flatnonzero((cosines[index] > 0.0) & (cosines[index] < grazing))
+        visible[index, low] *= receivers.above_faces(low + place.start, direction)
+        if tracer is None:
+            continue
+        facing = np.flatnonzero(visible[index] > 0.0)
         rays += len(facing)
         hit = tracer.occluded(np.take(origins, facing, axis=0), direction[None, :])
         visible[index, facing[hit]] = 0.0

@@ -159,10 +159,12 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
 def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task) -> tuple[_Entries, int]:
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
-    origins = receivers.origins[place]
+    origins, grazing = receivers.origins[place], receivers.grazing[place]
     cosines = facing_cosines(task.directions, receivers.normals[place])
     result, rays = _Entries([], [], []), 0
     for index, direction in enumerate(task.directions):
+        low = np.flatnonzero((cosines[index] > 0.0) & (cosines[index] < grazing))
+        cosines[index, low] *= receivers.above_faces(low + place.start, direction)
         facing = np.flatnonzero(cosines[index] > 0.0)
         rays += len(facing)
         hits = tracer.nearest(np.take(origins, facing, axis=0), direction[None, :])

@@ -45,15 +45,20 @@ class DistantSuns:
 
 @dataclass
 class _Paths:
-    """Paths in flight: owner among the receivers, place and normal of their last surface, throughput (n, 3)."""
+    """Paths in flight: owner among the receivers, place and normal of their last surface, throughput (n, 3).
+
+    faces: (n, 3) normal of the face they are on; None at the receivers, which lie on several.
+    """
 
     owner: NDArray[np.int64]
     origins: NDArray[np.float32]
     normals: NDArray[np.float64]
     throughput: NDArray[np.float64]
+    faces: NDArray[np.float64] | None = None
 
     def subset(self, which: NDArray) -> _Paths:
-        return _Paths(self.owner[which], self.origins[which], self.normals[which], self.throughput[which])
+        faces = None if self.faces is None else self.faces[which]
+        return _Paths(self.owner[which], self.origins[which], self.normals[which], self.throughput[which], faces)
 
 
 def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, albedo: NDArray[np.float32],
@@ -90,8 +95,9 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
     first = _stratified(number, count, generator)
     depth = 0
     while len(paths.owner):
-        _add_suns(tracer, paths, suns, total, generator)
+        _add_suns(tracer, receivers, part, paths, suns, total, generator)
         directions = _cosine_directions(paths.normals, first if depth == 0 else generator.random((len(paths.owner), 2)))
+        paths, directions = _above_surface(receivers, part, paths, directions, depth)
         hits = tracer.nearest(paths.origins, directions)
         tracer.rays += len(directions)
         escaped = hits.triangle < 0
@@ -103,6 +109,17 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
         paths = _roulette(paths, generator) if depth >= SURE_BOUNCES else paths
         depth += 1
     return total / count
+
+
+def _above_surface(receivers: ReceiverSet, part: slice, paths: _Paths, directions: NDArray[np.float32], depth: int,
+                   ) -> tuple[_Paths, NDArray[np.float32]]:
+    """Paths weighted by (at receivers) or ended by (at hits) whether they go on above the face they are on."""
+    if depth == 0:
+        share = receivers.above_faces(paths.owner + part.start, directions)
+        paths.throughput *= share[:, None]
+        return paths, directions
+    above = np.sum(paths.faces * directions, axis=1) > 0.0
+    return paths.subset(above), directions[above]
 
 
 def _stratified(number: int, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
@@ -119,12 +136,16 @@ def _cosine_directions(normals: NDArray[np.float64], numbers: NDArray[np.float64
     return np.sum(local[:, :, None] * tangent_frames(normals), axis=1).astype(np.float32)
 
 
-def _add_suns(tracer: Tracer, paths: _Paths, suns: DistantSuns, total: NDArray[np.float64],
-              generator: np.random.Generator) -> None:
+def _add_suns(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths, suns: DistantSuns,
+              total: NDArray[np.float64], generator: np.random.Generator) -> None:
     """Add each sun's reflected light at the paths' surfaces to the last emission value."""
     for direction, irradiance, angle in zip(suns.directions, suns.irradiance, suns.angles, strict=True):
         towards, scale = _disc_directions(direction, float(angle), len(paths.owner), generator)
         cosine = np.sum(paths.normals * towards, axis=1)
+        if paths.faces is None:
+            cosine *= receivers.above_faces(paths.owner + part.start, towards)
+        else:
+            cosine *= np.sum(paths.faces * towards, axis=1) > 0.0
         facing = np.flatnonzero(cosine > 0.0)
         seen = facing[~tracer.occluded(paths.origins[facing], towards[facing].astype(np.float32))]
         tracer.rays += len(facing)
@@ -160,7 +181,7 @@ def _next(tracer: Tracer, scene: SceneMesh, paths: _Paths, directions: NDArray[n
     normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), 1e-12)
     origin = np.sum(weights * places, axis=1) + side * face * (HIT_LIFT * LIFT * tracer.diagonal)
     dimmed = paths.throughput[met] * np.sum(weights * albedo[corner].astype(np.float64), axis=1)
-    return _Paths(paths.owner[met], tracer.to_tracing_space(origin), side * normal, dimmed)
+    return _Paths(paths.owner[met], tracer.to_tracing_space(origin), side * normal, dimmed, side * face)
 
 
 def _roulette(paths: _Paths, generator: np.random.Generator) -> _Paths:

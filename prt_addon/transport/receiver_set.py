@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.directions import random_rotation
-from ..scene.receivers import morton_order, ray_origins
+from ..scene.receivers import adjacent_faces, morton_order, ray_origins
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 
@@ -24,12 +24,16 @@ class ReceiverSet:
     """r receivers in the order in which they are traced.
 
     key: (r,) int64, point + side * points (side 0 front, 1 back); origins: (r, 3) float32 in tracing space;
-    normals: (r, 3) float64, towards the receiver's side.
+    normals: (r, 3) float64, towards the receiver's side; faces: (r, k, 3) float32 unit normals of the adjacent faces,
+    face_weights: (r, k), sum 1; grazing: (r,) float32, cosine below which a direction may lie under one of the faces.
     """
 
     key: NDArray[np.int64]
     origins: NDArray[np.float32]
     normals: NDArray[np.float64]
+    faces: NDArray[np.float32]
+    face_weights: NDArray[np.float32]
+    grazing: NDArray[np.float32]
 
     @staticmethod
     def of_keys(scene: SceneMesh, tracer: Tracer, keys: NDArray[np.int64]) -> ReceiverSet:
@@ -45,13 +49,34 @@ class ReceiverSet:
                 origins[chosen] = starts[points]
                 normals[chosen] = side * scene.normals[points]
         order = morton_order(origins)
-        return ReceiverSet(keys[order], tracer.to_tracing_space(origins[order]), normals[order])
+        points = keys[order] % count
+        faces, weights = (values[points] for values in adjacent_faces(scene.points, scene.triangles))
+        faces[back[order]] *= -1.0
+        normals = normals[order]
+        agreement = np.where(weights > 0.0, np.sum(faces * normals[:, None, :], axis=2), 1.0).min(axis=1)
+        # A direction at angle a from the normal is above a face tilted by b if a + b < 90 degrees: cos a > sin b. The
+        # slack covers single precision.
+        grazing = np.where(agreement > 0.0, np.sqrt(np.maximum(1.0 - agreement ** 2, 0.0)), 1.0) - 1e-4
+        return ReceiverSet(keys[order], tracer.to_tracing_space(origins[order]), normals, faces, weights,
+                           grazing.astype(np.float32))
 
     @staticmethod
     def joined(sets: list[ReceiverSet]) -> ReceiverSet:
         """Sets one after the other (each keeps its own Morton order)."""
-        names = ("key", "origins", "normals")
-        return ReceiverSet(*(np.concatenate([getattr(s, name) for s in sets]) for name in names))
+        return ReceiverSet(*(np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(ReceiverSet)))
+
+    def taken(self, place: NDArray[np.int64]) -> ReceiverSet:
+        """The receivers at these places, in this order."""
+        return ReceiverSet(*(getattr(self, f.name)[place] for f in fields(self)))
+
+    def above_faces(self, place: NDArray[np.int64], direction: NDArray[np.float32]) -> NDArray[np.float32]:
+        """For which share (n,) of their faces one direction (3,), or one each (n, 3), lies above the face.
+
+        Light from under a face does not reach it, whatever the interpolated normal says: what a renderer shows around
+        a vertex is the mean over its faces of their clipped hemispheres.
+        """
+        height = np.sum(self.faces[place] * np.atleast_2d(direction)[:, None, :], axis=2)
+        return np.sum(self.face_weights[place] * (height > 0.0), axis=1)
 
     def __len__(self) -> int:
         return len(self.key)

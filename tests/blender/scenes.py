@@ -91,7 +91,7 @@ def _describe(struct: bpy.types.bpy_struct, path: str, lines: list[str], depth: 
         elif item.type == "COLLECTION" and depth < 4:
             lines.append(f"{path}.{name} count {len(value)}")
             for index, element in enumerate(value):
-                if element is None or isinstance(element, bpy.types.ID) and not element.is_embedded_data:
+                if element is None or (isinstance(element, bpy.types.ID) and not element.is_embedded_data):
                     lines.append(f"{path}.{name}[{index}]->{element and element.name_full}")
                 else:
                     _describe(element, f"{path}.{name}[{index}]", lines, depth + 1)

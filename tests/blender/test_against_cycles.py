@@ -6,7 +6,6 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
-from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
 
 from prt_addon.baking.recipe import bake, exhaust
 from prt_addon.baking.settings import make_settings
@@ -14,6 +13,7 @@ from prt_addon.blender.read_scene import read_objects
 from prt_addon.lighting.environment import project, world_rotation
 from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
 from prt_addon.scene.scene_mesh import SceneMesh
+from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
 
 # Cycles' own noise at these samples: two bakes with other seeds differ by sqrt(2) times it (asserted below).
 SAMPLES = 1024
@@ -71,7 +71,7 @@ def test_radiance_of_a_smooth_environment(still_life, tmp_path, passes, bounces,
         assert noise < 0.01
         truth = 0.5 * (theirs[0] + theirs[1])
         error = relative_rms(ours, truth)
-        print(f"{sorted(passes)} at {degrees:g} degrees: relative RMS {error:.4f}, of it Cycles' noise {noise / 2**0.5:.4f}")
+        print(f"{sorted(passes)} at {degrees:g} degrees: error {error:.4f}, noise of the mean {noise / 2**0.5:.4f}")
         assert error < limit
         # Orientation: any other turn fits far worse.
         turned = np.concatenate([relit(containers[o.name], image, degrees + 90.0) for o in bpy.data.objects])

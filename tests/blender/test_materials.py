@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Albedo of node trees: the plain colours read from values against Cycles' own answer, the rest against known colours."""
+"""Albedo of node trees: plain colours against Cycles' own answer, the rest against known colours."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import bpy
 import numpy as np
 import pytest
-from tests.blender.scenes import add_cube, add_material, add_mesh, depsgraph, user_data_lines
 
 from prt_addon.blender import materials
 from prt_addon.blender.read_scene import read_objects
+from tests.blender.scenes import add_cube, add_material, add_mesh, depsgraph, user_data_lines
 
 QUAD = ([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 1, 2, 3)])
+Builder = Callable[[bpy.types.NodeTree, bpy.types.Node], None]
 COLOUR = (0.7, 0.4, 0.2, 1.0)
 
 
-def shader(kind: str, **values: object):
+def shader(kind: str, **values: object) -> Builder:
     """A builder of a material that is one shader node with these input values."""
     def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
         node = tree.nodes.new(kind)
@@ -25,7 +28,7 @@ def shader(kind: str, **values: object):
     return build
 
 
-def colour_through(kind: str, socket: str = "Color"):
+def colour_through(kind: str, socket: str = "Color") -> Builder:
     """A builder: a colour node into a Diffuse BSDF; the caller sets it up."""
     def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
         source, bsdf = tree.nodes.new(kind), tree.nodes.new("ShaderNodeBsdfDiffuse")
@@ -56,7 +59,7 @@ def albedo_of_quad(material: bpy.types.Material | None) -> np.ndarray:
     lambda tree, output: None,
     colour_through("ShaderNodeRGB"),
 ])
-def test_plain_colours_equal_cycles(scene, monkeypatch, build) -> None:
+def test_plain_colours_equal_cycles(scene: bpy.types.Scene, monkeypatch: pytest.MonkeyPatch, build: Builder) -> None:
     material = add_material("M", build)
     read = materials.constant_albedo(material)
     assert read is not None
@@ -64,14 +67,14 @@ def test_plain_colours_equal_cycles(scene, monkeypatch, build) -> None:
     assert np.allclose(albedo_of_quad(material), read, atol=2e-6)
 
 
-def test_no_material_is_cycles_default(scene) -> None:
+def test_no_material_is_cycles_default(scene: bpy.types.Scene) -> None:
     cube = add_cube()
     assert np.allclose(read_objects(depsgraph())[0].corner_albedo, 0.8)
     cube.data.materials.append(None)
     assert np.allclose(read_objects(depsgraph())[0].corner_albedo, 0.8)
 
 
-def test_vertex_colours_arrive_at_their_corners(scene) -> None:
+def test_vertex_colours_arrive_at_their_corners(scene: bpy.types.Scene) -> None:
     quad = add_mesh("Quad", *QUAD)
     wanted = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.25, 0.5, 0.75)], np.float32)
     layer = quad.data.color_attributes.new("Paint", "FLOAT_COLOR", "POINT")
@@ -82,7 +85,7 @@ def test_vertex_colours_arrive_at_their_corners(scene) -> None:
     assert np.allclose(mesh.corner_albedo, wanted[mesh.triangles], atol=1e-3)
 
 
-def test_image_texture_is_linearised(scene) -> None:
+def test_image_texture_is_linearised(scene: bpy.types.Scene) -> None:
     image = bpy.data.images.new("Texture", 2, 1)
     image.pixels.foreach_set(np.array([0.5, 0.5, 0.5, 1, 1, 0, 0, 1], np.float32))
     material = add_material("M", colour_through("ShaderNodeTexImage"))
@@ -99,7 +102,7 @@ def test_image_texture_is_linearised(scene) -> None:
     assert np.allclose(mesh.corner_albedo[~left], (1, 0, 0), atol=2e-3)
 
 
-def test_mixes_and_highlights_inside_groups(scene) -> None:
+def test_mixes_and_highlights_inside_groups(scene: bpy.types.Scene) -> None:
     group = bpy.data.node_groups.new("Group", "ShaderNodeTree")
     group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
     end = group.nodes.new("NodeGroupOutput")
@@ -122,7 +125,7 @@ def test_mixes_and_highlights_inside_groups(scene) -> None:
     assert first.inputs["Specular IOR Level"].default_value == 0.5
 
 
-def test_object_space_texture_uses_the_objects_transform(scene) -> None:
+def test_object_space_texture_uses_the_objects_transform(scene: bpy.types.Scene) -> None:
     """Colour = world position through the Geometry node."""
     material = add_material("M", colour_through("ShaderNodeNewGeometry", "Position"))
     quad = add_mesh("Quad", *QUAD)
@@ -132,7 +135,7 @@ def test_object_space_texture_uses_the_objects_transform(scene) -> None:
     assert np.allclose(mesh.corner_albedo, mesh.positions[mesh.triangles], atol=1e-3)
 
 
-def test_generated_geometry_is_evaluated_too(scene) -> None:
+def test_generated_geometry_is_evaluated_too(scene: bpy.types.Scene) -> None:
     """A cube that only nodes make, coloured by position."""
     tree = bpy.data.node_groups.new("Make", "GeometryNodeTree")
     tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
@@ -172,7 +175,7 @@ def busy_scene() -> None:
 
 
 @pytest.mark.parametrize("mode", ["OBJECT", "EDIT", "VERTEX_PAINT"])
-def test_nothing_of_the_users_changes(scene, mode) -> None:
+def test_nothing_of_the_users_changes(scene: bpy.types.Scene, mode: str) -> None:
     busy_scene()
     bpy.ops.object.mode_set(mode=mode)
     depsgraph()
@@ -184,7 +187,7 @@ def test_nothing_of_the_users_changes(scene, mode) -> None:
     assert len(after) == len(before)
 
 
-def test_the_scenes_own_light_does_not_matter(scene) -> None:
+def test_the_scenes_own_light_does_not_matter(scene: bpy.types.Scene) -> None:
     material = add_material("M", colour_through("ShaderNodeTexChecker"))
     dark = albedo_of_quad(material)
     scene.world = bpy.data.worlds.new("World")
@@ -194,7 +197,7 @@ def test_the_scenes_own_light_does_not_matter(scene) -> None:
     assert np.array_equal(albedo_of_quad(material), dark)
 
 
-def test_nothing_is_left_after_a_failure(scene, monkeypatch) -> None:
+def test_nothing_is_left_after_a_failure(scene: bpy.types.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     busy_scene()
     before = user_data_lines()
 
@@ -207,7 +210,7 @@ def test_nothing_is_left_after_a_failure(scene, monkeypatch) -> None:
     assert user_data_lines() == before
 
 
-def test_digest_follows_values_links_and_groups(scene) -> None:
+def test_digest_follows_values_links_and_groups(scene: bpy.types.Scene) -> None:
     material = add_material("M", colour_through("ShaderNodeTexChecker"))
     digests = [materials.material_digest([material])]
     nodes = {n.bl_idname: n for n in material.node_tree.nodes}

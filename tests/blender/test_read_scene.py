@@ -3,24 +3,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 import numpy as np
 import pytest
-from tests.blender.scenes import add_cube, add_material, add_mesh, depsgraph, place, unit, user_data_lines
 from mathutils import Matrix
 
 from prt_addon.blender.read_scene import read_objects
 from prt_addon.errors import BadScene
-from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.scene.scene_mesh import ObjectMesh, SceneMesh
+from tests.blender.scenes import add_cube, add_material, add_mesh, depsgraph, place, unit, user_data_lines
 
 TRIANGLE = ([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
 
 
-def by_name(objects: list) -> dict:
+def by_name(objects: list[ObjectMesh]) -> dict[str, ObjectMesh]:
     return {o.name: o for o in objects}
 
 
-def face_normals(mesh) -> np.ndarray:
+def face_normals(mesh: ObjectMesh) -> np.ndarray:
     corners = mesh.positions[mesh.triangles]
     return unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
@@ -33,7 +35,7 @@ def face_normals(mesh) -> np.ndarray:
     Matrix.Diagonal((1e-6, 1e-6, 1e-6, 1)),
     Matrix.Diagonal((1e6, 1e6, -1e6, 1)),
 ], ids=["rigid", "mirror", "negative", "shear", "tiny", "huge"])
-def test_any_transform_keeps_cube_closed_and_facing_out(scene, matrix) -> None:
+def test_any_transform_keeps_cube_closed_and_facing_out(scene: bpy.types.Scene, matrix: Matrix) -> None:
     cube = add_cube()
     place(cube, matrix)
     mesh, = read_objects(depsgraph())
@@ -51,7 +53,7 @@ def test_any_transform_keeps_cube_closed_and_facing_out(scene, matrix) -> None:
     assert np.allclose(mesh.matrix, used)
 
 
-def test_smooth_normals_under_shear_are_those_of_the_sheared_ellipsoid(scene) -> None:
+def test_smooth_normals_under_shear_are_those_of_the_sheared_ellipsoid(scene: bpy.types.Scene) -> None:
     bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32)
     sphere = bpy.context.object
     bpy.ops.object.shade_smooth()
@@ -64,7 +66,7 @@ def test_smooth_normals_under_shear_are_those_of_the_sheared_ellipsoid(scene) ->
     assert np.max(np.linalg.norm(mesh.corner_normals - exact, axis=2)) < 0.02
 
 
-def test_custom_normals_survive(scene) -> None:
+def test_custom_normals_survive(scene: bpy.types.Scene) -> None:
     triangle = add_mesh("T", *TRIANGLE)
     wanted = unit(np.array([(0.2, 0.1, 1), (-0.3, 0, 1), (0, 0.4, 1)]))
     triangle.data.normals_split_custom_set([tuple(n) for n in wanted])
@@ -73,7 +75,7 @@ def test_custom_normals_survive(scene) -> None:
     assert np.allclose(mesh.corner_normals[0], wanted[order], atol=1e-3)
 
 
-def test_modifiers_are_evaluated(scene) -> None:
+def test_modifiers_are_evaluated(scene: bpy.types.Scene) -> None:
     cube = add_cube()
     modifier = cube.modifiers.new("Array", "ARRAY")
     modifier.count = 3
@@ -84,13 +86,13 @@ def test_modifiers_are_evaluated(scene) -> None:
     assert len(read_objects(depsgraph())[0].positions) == 8
 
 
-def test_subdivision_gives_its_faces(scene) -> None:
+def test_subdivision_gives_its_faces(scene: bpy.types.Scene) -> None:
     cube = add_cube()
     cube.modifiers.new("Subdivision", "SUBSURF").levels = 2
     assert len(read_objects(depsgraph())[0].triangles) == 6 * 16 * 2
 
 
-def test_collection_instance_is_one_mesh_named_after_the_instancer(scene) -> None:
+def test_collection_instance_is_one_mesh_named_after_the_instancer(scene: bpy.types.Scene) -> None:
     collection = bpy.data.collections.new("Library")
     add_cube("A", collection)
     add_mesh("B", *TRIANGLE, collection)
@@ -135,7 +137,7 @@ def _diffuse(tree: bpy.types.NodeTree, output: bpy.types.Node, colour: tuple) ->
     tree.links.new(node.outputs[0], output.inputs["Surface"])
 
 
-def test_geometry_nodes_instances_join_their_object_with_their_own_material(scene) -> None:
+def test_geometry_nodes_instances_join_their_object_with_their_own_material(scene: bpy.types.Scene) -> None:
     triangle = add_mesh("Ground", *TRIANGLE)
     triangle.scale = (2, 2, 2)
     triangle.modifiers.new("Scatter", "NODES").node_group = scattering_nodes()
@@ -147,7 +149,7 @@ def test_geometry_nodes_instances_join_their_object_with_their_own_material(scen
     assert np.allclose(mesh.corner_albedo[~red], 0.8)
 
 
-def test_vertex_instances_and_text(scene) -> None:
+def test_vertex_instances_and_text(scene: bpy.types.Scene) -> None:
     parent, child = add_mesh("Parent", *TRIANGLE), add_cube("Child")
     child.parent, child.scale, parent.instance_type = parent, (0.1, 0.1, 0.1), "VERTS"
     text = bpy.data.curves.new("Text", "FONT")
@@ -159,7 +161,7 @@ def test_vertex_instances_and_text(scene) -> None:
     assert not meshes["Text"].is_target
 
 
-def test_render_visibility_decides_and_the_viewports_does_not(scene) -> None:
+def test_render_visibility_decides_and_the_viewports_does_not(scene: bpy.types.Scene) -> None:
     add_cube("Seen")
     for name in ("Eye", "Monitor", "Camera"):
         add_cube(name)
@@ -189,14 +191,15 @@ def test_render_visibility_decides_and_the_viewports_does_not(scene) -> None:
     (lambda: bpy.context.scene.collection.objects.link(bpy.data.objects.new("Null", None)), ["Null"], "scene",
      "no mesh"),
 ])
-def test_bad_input_is_named(scene, make, targets, name, words) -> None:
+def test_bad_input_is_named(scene: bpy.types.Scene, make: Callable[..., object], targets: list[str] | None, name: str,
+                             words: str) -> None:
     make()
     with pytest.raises(BadScene, match=words) as caught:
         read_objects(depsgraph(), targets)
     assert caught.value.subject == name
 
 
-def test_a_flat_caster_is_fine(scene) -> None:
+def test_a_flat_caster_is_fine(scene: bpy.types.Scene) -> None:
     add_cube("Target")
     add_cube("Flat").scale = (1, 1, 0)
     meshes = by_name(read_objects(depsgraph(), ["Target"]))
@@ -205,7 +208,7 @@ def test_a_flat_caster_is_fine(scene) -> None:
                        (0, 0, 1), atol=1e-6)
 
 
-def test_several_materials_per_mesh(scene) -> None:
+def test_several_materials_per_mesh(scene: bpy.types.Scene) -> None:
     cube = add_cube()
     colours = [(0.1, 0.2, 0.3, 1), (0.7, 0.6, 0.5, 1)]
     for index, colour in enumerate(colours):

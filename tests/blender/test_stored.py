@@ -4,19 +4,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
-from tests.blender.scenes import add_cube, depsgraph, place, user_data_lines
 
 from prt_addon.blender import fingerprint, stored
 from prt_addon.blender.read_scene import read_objects
 from prt_addon.errors import StorageError
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.storage.container import BakedTransfer, make_header
+from tests.blender.scenes import add_cube, depsgraph, place, user_data_lines
 
 CLUSTERS, VECTORS, COLUMNS = 3, 6, 16
 
@@ -66,7 +67,7 @@ def _turned(triangle: list[int]) -> tuple[int, ...]:
     return tuple(triangle[start:] + triangle[:start])
 
 
-def test_contract_layout_on_the_own_mesh(scene) -> None:
+def test_contract_layout_on_the_own_mesh(scene: bpy.types.Scene) -> None:
     sphere = add_smooth_sphere()
     baked = bake_of(sphere)
     mesh = stored.write_baked(sphere, baked)
@@ -97,7 +98,7 @@ TRANSFORMS = {"rigid": Matrix.Translation((5, 1, -3)) @ Matrix.Rotation(1.0, 4, 
 
 @pytest.mark.parametrize("transform", TRANSFORMS)
 @pytest.mark.parametrize("make", [add_smooth_sphere, add_cube], ids=["own mesh", "receiver"])
-def test_roundtrip_under_any_transform(scene, make, transform) -> None:
+def test_roundtrip_under_any_transform(scene: bpy.types.Scene, make: Callable[..., object], transform: str) -> None:
     scene_object = make()
     place(scene_object, TRANSFORMS[transform])
     baked = bake_of(scene_object)
@@ -107,7 +108,7 @@ def test_roundtrip_under_any_transform(scene, make, transform) -> None:
     assert stored.stale(scene_object, depsgraph()) is None
 
 
-def test_receiver_is_a_hidden_child_in_place(scene) -> None:
+def test_receiver_is_a_hidden_child_in_place(scene: bpy.types.Scene) -> None:
     cube = add_cube("Box")
     cube.location, cube.scale = (1, 2, 3), (2, 1, 1)
     baked = bake_of(cube)
@@ -134,7 +135,7 @@ def test_receiver_is_a_hidden_child_in_place(scene) -> None:
     assert [m.name for m in bpy.data.meshes if m.name.startswith("PRT")] == ["PRT Box"]
 
 
-def test_modifiers_and_shared_meshes_get_receivers(scene) -> None:
+def test_modifiers_and_shared_meshes_get_receivers(scene: bpy.types.Scene) -> None:
     first = add_smooth_sphere("First")
     second = bpy.data.objects.new("Second", first.data)
     scene.collection.objects.link(second)
@@ -154,7 +155,7 @@ def test_modifiers_and_shared_meshes_get_receivers(scene) -> None:
     assert stored.write_baked(third, baked).name == "PRT Third"
 
 
-def test_moving_between_own_mesh_and_receiver_leaves_one_bake(scene) -> None:
+def test_moving_between_own_mesh_and_receiver_leaves_one_bake(scene: bpy.types.Scene) -> None:
     sphere = add_smooth_sphere()
     stored.write_baked(sphere, bake_of(sphere))
     sphere.modifiers.new("Subdivision", "SUBSURF")
@@ -171,7 +172,7 @@ def test_moving_between_own_mesh_and_receiver_leaves_one_bake(scene) -> None:
 
 
 @pytest.mark.parametrize("make", [add_smooth_sphere, add_cube], ids=["own mesh", "receiver"])
-def test_clear_restores_the_file(scene, make) -> None:
+def test_clear_restores_the_file(scene: bpy.types.Scene, make: Callable[..., object]) -> None:
     scene_object = make()
     paint = scene_object.data.color_attributes.new("Paint", "BYTE_COLOR", "CORNER")
     scene_object.data.color_attributes.active_color = paint
@@ -186,7 +187,8 @@ def test_clear_restores_the_file(scene, make) -> None:
 
 
 @pytest.mark.parametrize("make", [add_smooth_sphere, add_cube], ids=["own mesh", "receiver"])
-def test_survives_save_load_rename_append_link(scene, make, tmp_path: Path) -> None:
+def test_survives_save_load_rename_append_link(scene: bpy.types.Scene, make: Callable[..., object],
+                                               tmp_path: Path) -> None:
     scene_object = make()
     scene_object.name = scene_object.data.name = "Original"
     place(scene_object, TRANSFORMS["shear"])
@@ -212,7 +214,7 @@ def test_survives_save_load_rename_append_link(scene, make, tmp_path: Path) -> N
                 stored.write_baked(arrived, baked)
 
 
-def test_a_copy_keeps_to_itself(scene) -> None:
+def test_a_copy_keeps_to_itself(scene: bpy.types.Scene) -> None:
     cube = add_cube("Box")
     baked = bake_of(cube)
     stored.write_baked(cube, baked)
@@ -247,7 +249,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("make", [add_smooth_sphere, add_cube], ids=["own mesh", "receiver"])
 @pytest.mark.parametrize("change", CHANGES)
-def test_any_change_makes_it_stale(scene, make, change) -> None:
+def test_any_change_makes_it_stale(scene: bpy.types.Scene, make: Callable[..., object], change: str) -> None:
     scene_object = make()
     stored.write_baked(scene_object, bake_of(scene_object))
     assert stored.stale(scene_object, depsgraph()) is None
@@ -256,7 +258,7 @@ def test_any_change_makes_it_stale(scene, make, change) -> None:
     assert words in stored.stale(scene_object, depsgraph())
 
 
-def test_changing_a_modifier_makes_it_stale_and_undoing_it_does_not(scene) -> None:
+def test_changing_a_modifier_makes_it_stale_and_undoing_it_does_not(scene: bpy.types.Scene) -> None:
     cube = add_cube()
     modifier = cube.modifiers.new("Bevel", "BEVEL")
     stored.write_baked(cube, bake_of(cube))
@@ -266,7 +268,7 @@ def test_changing_a_modifier_makes_it_stale_and_undoing_it_does_not(scene) -> No
     assert stored.stale(cube, depsgraph()) is None
 
 
-def test_other_objects_count_when_asked(scene) -> None:
+def test_other_objects_count_when_asked(scene: bpy.types.Scene) -> None:
     cube, other = add_cube(), add_cube("Lamp post")
     other.location = (3, 0, 0)
     baked = bake_of(cube)
@@ -283,7 +285,7 @@ def test_other_objects_count_when_asked(scene) -> None:
     assert "Lamp post" in stored.stale(cube, graph, fingerprint.surroundings(graph))
 
 
-def test_digest_taken_when_read_is_what_counts(scene) -> None:
+def test_digest_taken_when_read_is_what_counts(scene: bpy.types.Scene) -> None:
     """An edit during the bake must show when it ends."""
     cube = add_cube()
     digests = fingerprint.fingerprint(cube, depsgraph())
@@ -294,7 +296,7 @@ def test_digest_taken_when_read_is_what_counts(scene) -> None:
     assert "mesh or modifiers" in stored.stale(cube, depsgraph())
 
 
-def test_transform_since_bake(scene) -> None:
+def test_transform_since_bake(scene: bpy.types.Scene) -> None:
     cube = add_cube()
     place(cube, TRANSFORMS["shear"])
     baked = bake_of(cube)
@@ -323,7 +325,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_or_newer_data_is_refused(scene, damage) -> None:
+def test_damaged_or_newer_data_is_refused(scene: bpy.types.Scene, damage: str) -> None:
     sphere = add_smooth_sphere()
     mesh = stored.write_baked(sphere, bake_of(sphere))
     spoil, words = DAMAGE[damage]
@@ -337,7 +339,7 @@ def test_damaged_or_newer_data_is_refused(scene, damage) -> None:
     assert stored.clear_baked(sphere)
 
 
-def test_an_incomplete_bake_leaves_the_previous_one(scene) -> None:
+def test_an_incomplete_bake_leaves_the_previous_one(scene: bpy.types.Scene) -> None:
     for scene_object in (add_smooth_sphere(), add_cube()):
         baked = bake_of(scene_object)
         stored.write_baked(scene_object, baked)
@@ -349,7 +351,7 @@ def test_an_incomplete_bake_leaves_the_previous_one(scene) -> None:
         assert_same(stored.read_baked(scene_object), baked)
 
 
-def test_edit_mode_is_said_not_misread(scene) -> None:
+def test_edit_mode_is_said_not_misread(scene: bpy.types.Scene) -> None:
     sphere = add_smooth_sphere()
     baked = bake_of(sphere)
     stored.write_baked(sphere, baked)

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,6 +25,11 @@ from prt_addon.compression.vector_quantization import lbg
 from prt_addon.errors import BadArguments, Cancelled, PRTError
 
 METHODS = ("static", "iterative", "adaptive")
+
+
+def quick(*arguments: Any, **named: Any) -> EncoderSettings:
+    """Settings without the additional starts of small signals, which tests do not need."""
+    return EncoderSettings(*arguments, **{"restarts": 0} | named)
 
 
 def surface_signal(points: int = 2000, values: int = 16, seed: int = 0) -> NDArray[np.float32]:
@@ -66,7 +74,7 @@ def papers_procedure(signal: NDArray, clusters: int, vectors: int, seed: int, sw
 @pytest.mark.parametrize("method", METHODS)
 def test_squared_error_is_the_sum_of_discarded_eigenvalues(method: str) -> None:
     signal = surface_signal()
-    result = encode(signal, EncoderSettings(20, 3, method))
+    result = encode(signal, quick(20, 3, method))
     discarded = sum(svd_fit(signal[result.cluster == k], 0)[2][result.vectors_per_cluster[k]:].sum()
                     for k in range(len(result.bases)))
     actual = ((result.decode().astype(float) - signal) ** 2).sum()
@@ -101,7 +109,7 @@ def test_principal_components_orthonormal_and_equal_svd() -> None:
 def test_no_vectors_is_kmeans_from_the_same_start() -> None:
     signal = surface_signal(1500, 8)
     start = signal[np.random.default_rng(3).permutation(len(signal))[:12]]
-    theirs = KMeans(12, init=start.astype(float), n_init=1, max_iter=1000, tol=0, algorithm="lloyd").fit(signal.astype(float))
+    theirs = KMeans(12, init=start.astype(float), n_init=1, max_iter=1000, tol=0).fit(signal.astype(float))
     labels = lbg(signal, start, 1000)
     assert (labels == theirs.labels_).mean() > 0.998
     encoded = vector_quantization(signal, 12, seed=3, iterations=1000)
@@ -112,7 +120,7 @@ def test_no_vectors_is_kmeans_from_the_same_start() -> None:
 
 def test_iterative_without_vectors_is_a_kmeans_fixed_point() -> None:
     signal = surface_signal(1500, 8)
-    encoded = encode(signal, EncoderSettings(12, 0, iterations=200, tolerance=0.0))
+    encoded = encode(signal, quick(12, 0, iterations=200, tolerance=0.0))
     again = KMeans(12, init=encoded.bases[:, 0].astype(float), n_init=1, max_iter=300, tol=0).fit(signal.astype(float))
     assert again.inertia_ == pytest.approx(encoded.squared_error, rel=1e-3)
 
@@ -128,7 +136,8 @@ def test_reclassification_equals_brute_force(vectors: int, rows: int, monkeypatc
             state.vectors = np.random.default_rng(2).integers(0, vectors + 1, 30)
         update(signal, state)
         occupied = state.counts > 0
-        squared = brute_squared_distances(signal, list(state.means), [b[:v] for b, v in zip(state.bases, state.vectors, strict=True)])
+        axes = [basis[:used] for basis, used in zip(state.bases, state.vectors, strict=True)]
+        squared = brute_squared_distances(signal, list(state.means), axes)
         squared[:, ~occupied] = np.inf
         reclassify(signal, state)
         chosen = squared[np.arange(3000), state.labels]
@@ -143,21 +152,20 @@ def test_update_converges_to_the_svd_and_never_raises_the_error() -> None:
     errors = [update(signal, state) for _ in range(40)]
     exact = sum(svd_fit(signal[labels == k], 0)[2][3:].sum() for k in range(5))
     assert errors[-1] == pytest.approx(exact, rel=1e-4)
-    assert all(after <= before * (1 + 1e-5) for before, after in zip(errors, errors[1:], strict=False))
+    assert all(after <= before * (1 + 1e-5) for before, after in itertools.pairwise(errors))
 
 
-@pytest.mark.parametrize("case", [(2000, 16, 12, 2), (1500, 9, 20, 1), (1500, 25, 10, 4), (1200, 12, 16, 3)])
-def test_never_worse_than_the_papers_procedure(case: tuple[int, int, int, int]) -> None:
-    points, values, clusters, vectors = case
-    for seed in range(2):
-        signal = surface_signal(points, values, seed)
-        ours = encode(signal, EncoderSettings(clusters, vectors)).squared_error
-        assert ours <= papers_procedure(signal, clusters, vectors, seed)
+@pytest.mark.parametrize("case", [(1200, 16, 12, 2, 0), (1200, 16, 12, 2, 1), (900, 9, 20, 1, 2), (900, 25, 10, 4, 3)])
+def test_never_worse_than_the_papers_procedure(case: tuple[int, int, int, int, int]) -> None:
+    points, values, clusters, vectors, seed = case
+    signal = surface_signal(points, values, seed)
+    ours = encode(signal, EncoderSettings(clusters, vectors)).squared_error
+    assert ours <= papers_procedure(signal, clusters, vectors, seed)
 
 
 def test_order_of_the_methods() -> None:
     signal = surface_signal(4000, 25)
-    static, iterative, adaptive = (encode(signal, EncoderSettings(40, 3, method)) for method in METHODS)
+    static, iterative, adaptive = (encode(signal, quick(40, 3, method)) for method in METHODS)
     assert iterative.squared_error < 0.9 * static.squared_error
     assert adaptive.squared_error <= iterative.squared_error
     assert (adaptive.vectors_per_cluster[adaptive.cluster]).mean() <= 3
@@ -171,7 +179,7 @@ def test_metric_is_minimised_and_measured() -> None:
     root = np.diag([5.0, 1.0, 0.1, 1.0]) @ np.linalg.qr(generator.normal(size=(4, 4)))[0]
     metric = root.T @ root
     signal = surface_signal(2000, 24)
-    plain, fitted = (encode(signal, EncoderSettings(16, 2), chosen) for chosen in (None, metric))
+    plain, fitted = (encode(signal, quick(16, 2), chosen) for chosen in (None, metric))
 
     def seen(decoded: NDArray) -> float:
         difference = (decoded - signal).astype(float).reshape(-1, 4, 6)
@@ -179,17 +187,17 @@ def test_metric_is_minimised_and_measured() -> None:
     assert fitted.squared_error == pytest.approx(seen(fitted.decode()), rel=1e-3)
     assert fitted.squared_error < 0.9 * seen(plain.decode())
     with pytest.raises(PRTError, match="metric"):
-        encode(signal, EncoderSettings(4, 1), -np.eye(4))
+        encode(signal, quick(4, 1), -np.eye(4))
     with pytest.raises(PRTError, match="metric"):
-        encode(signal, EncoderSettings(4, 1), np.eye(5))
+        encode(signal, quick(4, 1), np.eye(5))
 
 
-@pytest.mark.parametrize("target", [1e-1, 1e-3, 1e-5])
+@pytest.mark.parametrize("target", [1e-1, 1e-2])
 @pytest.mark.parametrize("method", METHODS[1:])
 def test_target_error_spends_less_where_the_signal_is_simple(target: float, method: str) -> None:
-    signal = surface_signal(3000, 16)
-    full = encode(signal, EncoderSettings(200, 4, method))
-    enough = encode(signal, EncoderSettings(200, 4, method, target_error=target))
+    signal = surface_signal(1500, 16)
+    full = encode(signal, quick(80, 4, method))
+    enough = encode(signal, quick(80, 4, method, target_error=target))
     assert full.relative_error < target
     assert enough.relative_error <= target
     assert enough.storage_cost < full.storage_cost
@@ -198,7 +206,7 @@ def test_target_error_spends_less_where_the_signal_is_simple(target: float, meth
 def test_simple_signals_get_few_clusters() -> None:
     generator = np.random.default_rng(0)
     plane = (generator.normal(size=(2000, 2)) @ generator.normal(size=(2, 16)) + 1).astype(np.float32)
-    result = encode(plane, EncoderSettings(64, 4, target_error=1e-6))
+    result = encode(plane, quick(64, 4, target_error=1e-6))
     assert len(result.bases) == 1
     assert result.vectors_per_cluster.tolist() == [2]
 
@@ -212,7 +220,7 @@ def test_simple_signals_get_few_clusters() -> None:
 ], ids=["zero", "constant", "one point", "one value", "few points", "duplicates", "scalars", "tiny", "huge"])
 def test_degenerate_signals(signal: NDArray, vectors: int, method: str) -> None:
     signal = signal.astype(np.float32)
-    result = encode(signal, EncoderSettings(8, vectors, method))
+    result = encode(signal, quick(8, vectors, method))
     decoded = result.decode()
     assert np.isfinite(result.bases).all() and np.isfinite(result.weights).all()
     assert result.cluster.shape == (len(signal),) and result.cluster.max() < len(result.bases) <= 8
@@ -227,7 +235,7 @@ def test_degenerate_signals(signal: NDArray, vectors: int, method: str) -> None:
 def test_points_of_very_different_scale(method: str) -> None:
     signal = surface_signal(1000, 8)
     signal[:10] *= 1e4
-    result = encode(signal, EncoderSettings(12, 2, method))
+    result = encode(signal, quick(30, 2, method))
     small = ((result.decode()[10:].astype(float) - signal[10:]) ** 2).sum() / (signal[10:].astype(float) ** 2).sum()
     assert small < 0.2
 
@@ -236,19 +244,19 @@ def test_unusable_input_is_told() -> None:
     signal = surface_signal(100, 4)
     signal[37, 2] = np.nan
     with pytest.raises(PRTError, match="point 37"):
-        encode(signal, EncoderSettings(4, 1))
+        encode(signal, quick(4, 1))
     with pytest.raises(PRTError, match="shape"):
-        encode(np.zeros((0, 4), np.float32), EncoderSettings(4, 1))
+        encode(np.zeros((0, 4), np.float32), quick(4, 1))
     for wrong in ({"clusters": 0}, {"vectors": -1}, {"method": "magic"}, {"iterations": 0}, {"target_error": -1.0},
-                  {"vectors_limit": 1}, {"tolerance": float("nan")}):
+                  {"vectors_limit": 1}, {"restarts": -1}, {"tolerance": float("nan")}):
         with pytest.raises(BadArguments):
-            EncoderSettings(**wrong)
+            quick(**wrong)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_same_seed_same_result(method: str) -> None:
     signal = surface_signal(1500, 12)
-    first, second = (encode(signal.copy(), EncoderSettings(16, 2, method, seed=9)) for _ in range(2))
+    first, second = (encode(signal.copy(), quick(16, 2, method, seed=9)) for _ in range(2))
     np.testing.assert_array_equal(first.cluster, second.cluster)
     np.testing.assert_array_equal(first.bases, second.bases)
     np.testing.assert_array_equal(first.weights, second.weights)
@@ -256,10 +264,10 @@ def test_same_seed_same_result(method: str) -> None:
 
 def test_result_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     signal = surface_signal(1500, 12)
-    whole = encode(signal, EncoderSettings(16, 2))
+    whole = encode(signal, quick(16, 2))
     monkeypatch.setattr(classification, "ROWS", 31)
     monkeypatch.setattr(classification, "BLOCK", 3)
-    parts = encode(signal, EncoderSettings(16, 2))
+    parts = encode(signal, quick(16, 2))
     assert (whole.cluster == parts.cluster).mean() > 0.995
     assert parts.squared_error == pytest.approx(whole.squared_error, rel=1e-3)
     monkeypatch.setattr(frames, "CHUNK", 100)
@@ -273,7 +281,7 @@ def test_result_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> No
 def test_progress_rises_and_may_cancel() -> None:
     signal = surface_signal(1500, 12)
     seen: list[float] = []
-    result = encode(signal, EncoderSettings(16, 3, "adaptive"), progress=seen.append)
+    result = encode(signal, quick(16, 3, "adaptive"), progress=seen.append)
     assert seen == sorted(seen) and seen[-1] == 1.0 and len(seen) > 4
     errors = [error for _, _, error in result.history]
     assert errors[-1] == pytest.approx(result.squared_error)
@@ -282,7 +290,7 @@ def test_progress_rises_and_may_cancel() -> None:
     def stop(fraction: float) -> None:
         raise Cancelled("bake", "stopped", "Run it again")
     with pytest.raises(Cancelled):
-        encode(signal, EncoderSettings(16, 3), progress=stop)
+        encode(signal, quick(16, 3), progress=stop)
 
 
 def test_distribution_keeps_to_the_budget_and_the_order() -> None:

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Per-vertex radiance against Cycles on real meshes under Blender's own world images, and 100 relightings against 100
+Cycles bakes. Needs the bpy wheel.
+
+    python benchmarks/against_cycles.py accuracy [--mesh spot.obj] [--samples 64] [--worlds forest,city] [--preset high]
+    python benchmarks/against_cycles.py speed [--mesh spot.obj] [--lights 100]
+
+accuracy: relative RMS over vertices and channels, direct and with bounces, at two rotations. Cycles is baked twice with
+other seeds; the mean of (ours - a)(ours - b) is the squared error without Cycles' own noise. `truncation` is what the
+order of the lighting leaves out, measured by the bake's own error budget under the same light.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+from common import mesh_path, print_table
+from numpy.typing import NDArray
+
+from prt_addon.baking.recipe import BakeResult, bake, exhaust
+from prt_addon.baking.settings import make_settings
+from prt_addon.blender.read_scene import read_objects
+from prt_addon.lighting.environment import load_equirectangular, project, world_rotation
+from prt_addon.lighting.reference_light import ReferenceLight
+from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
+from prt_addon.scene.scene_mesh import SceneMesh
+from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
+
+ALBEDO = (0.7, 0.5, 0.3, 1.0)
+
+
+def load(name: str) -> bpy.types.Object:
+    """The only object of an empty file: the smooth-shaded mesh with one coloured diffuse material."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    importer = bpy.ops.wm.obj_import if name.endswith("obj") else bpy.ops.wm.ply_import
+    importer(filepath=str(mesh_path(name)))
+    thing = bpy.context.selected_objects[0]
+    bpy.context.view_layer.objects.active = thing
+    bpy.ops.object.shade_smooth()
+    thing.data.materials.clear()
+    material = bpy.data.materials.new("Diffuse")
+    if material.node_tree is None:
+        material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    diffuse.inputs["Color"].default_value = ALBEDO
+    tree.links.new(diffuse.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs[0])
+    thing.data.materials.append(material)
+    return thing
+
+
+def light_image(world: str) -> NDArray[np.float32]:
+    """The smooth environment of the tests, or one of Blender's world images by name."""
+    if world == "smooth":
+        return smooth_environment()
+    folder = Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world"
+    return load_equirectangular(folder / f"{world}.exr")
+
+
+def use_world(image: NDArray[np.float32], degrees: float, folder: str) -> None:
+    """Light the scene; a small fixed sampling map saves Cycles seconds per bake and changes no expectation."""
+    world = environment_world(image, degrees, folder)
+    world.cycles.sampling_method, world.cycles.sample_map_resolution = "MANUAL", 512
+
+
+def baked(thing: bpy.types.Object, preset: str, bounces: int, image: NDArray[np.float32]) -> BakeResult:
+    """A bake of the object's vertices as they are."""
+    mesh = SceneMesh.assemble(read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name]), 0.0)
+    settings = make_settings(preset, {"bounces": str(bounces)})
+    return exhaust(bake(mesh, settings, light=ReferenceLight.of(image, None, [], "the world image")))
+
+
+def relit(result: BakeResult, image: NDArray[np.float32], degrees: float, count: int) -> NDArray[np.float64]:
+    """Unit-albedo radiance (count, 3) of the first receivers (the mesh's vertices)."""
+    container = next(iter(result.objects.values()))
+    light = project(image, container.header["columns"]["order"], world_rotation(degrees))
+    constants = cluster_constants(container.bases, light)
+    return exit_radiance(container.cluster, container.weights, constants)[:count, 0].astype(np.float64)
+
+
+def accuracy(arguments: argparse.Namespace) -> None:
+    thing = load(arguments.mesh)
+    use_cycles(arguments.samples)
+    bpy.context.scene.render.threads = 2
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for world in arguments.worlds.split(","):
+            image = light_image(world)
+            for passes, bounces in (({"DIRECT"}, 0), ({"DIRECT", "INDIRECT"}, -1)):
+                result = baked(thing, arguments.preset, bounces, image)
+                errors = {name: entry["relative_rms"] for name, entry in result.report["errors"].items()}
+                for degrees in (0.0, 130.0):
+                    use_world(image, degrees, folder)
+                    first, second = (vertex_radiance(thing, passes, seed) for seed in (0, 1))
+                    ours = relit(result, image, degrees, len(first))
+                    power = np.sum(first * second)
+                    error = np.sqrt(max(np.sum((ours - first) * (ours - second)) / power, 0.0))
+                    noise = np.sqrt(np.sum((first - second) ** 2) / 2.0 / power)
+                    rows.append([world, "+".join(sorted(passes)).lower(), degrees, 100 * error, 100 * errors["basis"],
+                                 100 * errors["sampling"], 100 * errors["compression"], 100 * noise])
+                    print(rows[-1], flush=True)
+    print_table(["world", "light", "turned", "error against Cycles %", "truncation %", "sampling %", "compression %",
+                 "Cycles' noise (removed) %"], rows)
+
+
+def speed(arguments: argparse.Namespace) -> None:
+    """Our bake and `lights` relightings against as many Cycles bakes at about equal error."""
+    thing = load(arguments.mesh)
+    image = smooth_environment()
+    with tempfile.TemporaryDirectory() as folder:
+        use_cycles(arguments.samples)
+        bpy.context.scene.render.threads = 2
+        use_world(image, 0.0, folder)
+        started = time.perf_counter()
+        first = vertex_radiance(thing, {"DIRECT", "INDIRECT"}, 0)
+        cycles = time.perf_counter() - started
+        second = vertex_radiance(thing, {"DIRECT", "INDIRECT"}, 1)
+    power = np.sum(first * second)
+    noise = np.sqrt(np.sum((first - second) ** 2) / 2.0 / power)
+    started = time.perf_counter()
+    result = baked(thing, arguments.preset, -1, image)
+    ours_bake = time.perf_counter() - started
+    started = time.perf_counter()
+    for index in range(arguments.lights):
+        ours = relit(result, image, 3.6 * index, len(first))
+    relights = time.perf_counter() - started
+    ours = relit(result, image, 0.0, len(first))
+    error = np.sqrt(max(np.sum((ours - first) * (ours - second)) / power, 0.0))
+    theirs = cycles * arguments.lights
+    print_table(["vertices", "our error %", "Cycles' error %", "our bake s", f"{arguments.lights} relightings s",
+                 "Cycles, one light s", "Cycles, all s", "times faster (floor 100)"],
+                [[len(first), 100 * error, 100 * noise, ours_bake, relights, cycles, theirs,
+                  theirs / (ours_bake + relights)]])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("accuracy", "speed"))
+    parser.add_argument("--mesh", default="spot.obj")
+    parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--worlds", default="smooth,forest,city,sunset")
+    parser.add_argument("--preset", default="high")
+    parser.add_argument("--lights", type=int, default=100)
+    arguments = parser.parse_args()
+    {"accuracy": accuracy, "speed": speed}[arguments.what](arguments)
+
+
+if __name__ == "__main__":
+    main()
