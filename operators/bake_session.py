@@ -143,5 +143,9 @@ def baked_message(result: BakeResult, seconds: float) -> str:
     names = list(result.objects)
     what = names[0] if len(names) == 1 else f"{len(names)} objects"
     text = f"Baked {what} in {seconds:.1f} s, {result.report['clusters']['count']} clusters"
-    total = result.report["errors"].get("total")
-    return text if total is None else f"{text}, error {100.0 * total['relative_rms']:.2f} %"
+    errors = {name: entry["relative_rms"] for name, entry in result.report["errors"].items()}
+    if "total" in errors:
+        text += f", error {100.0 * errors['total']:.2f} %"
+    if errors.get("basis", 0.0) > 0.5 * errors.get("total", 0.0):
+        text += ", mostly because the light is sharper than the order can show"
+    return text

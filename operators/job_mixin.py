@@ -16,7 +16,7 @@ from ..prt_addon.errors import Cancelled, PRTError
 from .bake_session import BakeSession
 from .properties import assign, session
 
-POLL_SECONDS = 0.1
+POLL_SECONDS = 0.2  # each tick redraws the sidebar
 
 
 def progress_text(message: Message) -> str:
@@ -90,7 +90,7 @@ class JobMixin:
         try:
             if job is None or JobMixin.cancel_requested:
                 raise Cancelled("Bake", "cancelled, nothing was changed", "Bake again to resume where it stopped")
-            for message in job.process.poll():
+            for message in job.process.poll()[-1:]:  # the last says it all: it alone can be an end
                 self._show(context, message)
             if not job.process.finished:
                 return {"PASS_THROUGH"}

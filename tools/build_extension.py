@@ -45,7 +45,7 @@ def blender_tool() -> Path:
 
 
 def notices(wheels: list[Wheel]) -> str:
-    """Names, versions and full licence texts of the bundled wheels: their own, and of what lies inside without its text."""
+    """Names, versions and full licence texts of the bundled wheels, and of what lies inside them without its text."""
     parts = ["# Third-party software in this extension", "", "The files in `wheels/` are unmodified. Their licences:"]
     for wheel in wheels:
         if wheel.python != PYTHONS[0]:

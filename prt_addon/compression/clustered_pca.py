@@ -19,6 +19,8 @@ from .vector_quantization import lbg, random_means
 TRUNCATION = 0.1
 # Vectors with which the first splits are judged.
 SEED_VECTORS = 2
+# Power steps for the first vectors of clusters that had none.
+FIRST_STEPS = 3
 # (stage, squared error in the frame's units, fraction done)
 Report = Callable[[str, float, float], None]
 
@@ -89,7 +91,11 @@ def iterate(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, eno
     error = np.inf
     for vectors in range(first, settings.vectors + 1):
         if vectors > first:
+            fresh = state.bases.shape[1] == 0
             add_vector(state)
+            if fresh:  # nothing to start from: one power step would classify by an arbitrary direction
+                for _ in range(FIRST_STEPS):
+                    update(frame.coordinates[:, :state.means.shape[1]], state)
         error = converge(frame, state, settings, settings.tolerance)
         report(f"{vectors} vectors", error, (vectors + 1 - first) / (settings.vectors + 2 - first))
         if error <= enough:

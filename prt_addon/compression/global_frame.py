@@ -86,36 +86,46 @@ def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None) ->
     check_signal(signal)
     points, values = signal.shape
     root, inverse_root = metric_roots(metric, values)
-    mean, covariance, largest = _moments(signal)
-    scale = 2.0 ** np.round(np.log2(largest)) if largest > 0 else 1.0
+    mean, covariance, scale = _moments(signal)
     within = multiply(multiply(root, covariance / points), root)
     _, axes = symmetric_eigenpairs((within + within.T) / 2)
     forward = multiply(root, axes) / scale
     backward = multiply(axes.T, inverse_root) * scale
     coordinates = np.empty((points, values), np.float32)
-    seen, offset = np.zeros(values), multiply(mean[None], forward)[0]
-    energy = 0.0
-    single = np.ascontiguousarray(forward, np.float32)
+    seen, sums = np.zeros(values), np.zeros(values)
+    single = np.ascontiguousarray(forward * scale, np.float32)
     for start in range(0, points, CHUNK):
         block = coordinates[start:start + CHUNK]
-        multiply(np.asarray(signal[start:start + CHUNK] - mean, np.float32), single, out=block)
-        squares = np.square(block, dtype=np.float64)
-        seen += squares.sum(axis=0)
-        energy += float(np.square(block + offset).sum())
+        multiply(_centred(signal[start:start + CHUNK], mean, scale), single, out=block)
+        seen += np.square(block).sum(axis=0, dtype=np.float64)
+        sums += block.sum(axis=0, dtype=np.float64)
     tail = np.append(np.cumsum(seen[::-1])[::-1], 0.0)
+    offset = multiply(mean[None], forward)[0]
+    energy = max(float(tail[0] + 2 * (offset * sums).sum() + points * (offset * offset).sum()), float(tail[0]) * 1e-3)
     return GlobalFrame(coordinates, mean, forward, backward, float(scale), tail, energy)
 
 
-def _moments(signal: NDArray[np.floating]) -> tuple[NDArray, NDArray, float]:
-    """Mean (n,), scatter about it (n, n), both float64 (the scatter divided by the square of the largest difference,
-    which is returned too): sums of single-precision products of blocks, about the mean, in double precision."""
+def _centred(block: NDArray[np.floating], mean: NDArray[np.float64], scale: float) -> NDArray[np.float32]:
+    """Rows less the mean, over the scale, in single precision; the mean itself is one of single precision."""
+    single = block.dtype == np.float32
+    result = block - (mean.astype(np.float32) if single else mean)
+    result *= 1 / scale
+    return np.ascontiguousarray(result, np.float32)
+
+
+def _moments(signal: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Mean (n,) rounded to single precision, scatter about it (n, n) over the scale's square, and the scale, the power
+    of two nearest to the largest difference from the mean: sums of single-precision blocks in double precision."""
     points, values = signal.shape
-    mean = np.zeros(values)
+    mean, low, high = np.zeros(values), np.full(values, np.inf), np.full(values, -np.inf)
     for start in range(0, points, CHUNK):
-        mean += signal[start:start + CHUNK].sum(axis=0, dtype=np.float64)
-    mean /= points
-    largest = max(float(np.abs(signal[start:start + CHUNK] - mean).max()) for start in range(0, points, CHUNK))
+        block = signal[start:start + CHUNK]
+        mean += block.sum(axis=0, dtype=np.float64)
+        low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
+    mean = (mean / points).astype(np.float32).astype(np.float64)
+    largest = float(np.maximum(high - mean, mean - low).max())
+    scale = float(2.0 ** np.round(np.log2(largest))) if largest > 0 else 1.0
     scatter = np.zeros((values, values))
     for start in range(0, points, CHUNK):
-        scatter += gram(np.asarray((signal[start:start + CHUNK] - mean) / (largest or 1.0), np.float32))
-    return mean, scatter, largest
+        scatter += gram(_centred(signal[start:start + CHUNK], mean, scale))
+    return mean, scatter, scale

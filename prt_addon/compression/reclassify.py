@@ -5,8 +5,8 @@ Write a point of cluster k as x = u + t, u its projection onto k's carried vecto
 dist(x, S_j) >= dist(u, S_j) - r', because the distance to a set changes no faster than the point moves, so j can only
 win where dist(u, S_j) < r + r', r being the distance to the own subspace (with the vectors in use; r' <= r with all
 carried ones). dist(u, S_j)^2 takes products of the block's size only, and before that
-dist(u, S_j) >= dist(mean_k, S_j) - |u - mean_k| rules out whole clusters. Only what survives both meets the full arithmetic, so labels equal brute force's
-up to ties within rounding.
+dist(u, S_j) >= dist(mean_k, S_j) - |u - mean_k| rules out whole clusters. Only what survives both meets the
+full arithmetic, so labels equal brute force's up to ties within rounding.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ def fit_subspace(points: Single, start: Single) -> Fit:
     rows /= np.maximum(np.sqrt(row_squares(rows)), np.float32(1e-30))[:, None]
     overlaps = multiply(rows, rows.T).astype(np.float64)
     solved = None
-    if 2 * np.abs(overlaps).sum(axis=1).max() < 3:  # diagonally dominant: rounding cannot spoil orthonormality
+    if np.abs(overlaps).sum(axis=1).max() < 1.9:  # diagonally dominant: rounding cannot spoil orthonormality
         weights = multiply(centred, rows.T)
         solved = small_generalized_eigenpairs(multiply(weights.T, weights).astype(np.float64), overlaps)
     if solved is None:

@@ -72,8 +72,9 @@ class ReceiverSet:
     def above_faces(self, place: NDArray[np.int64], direction: NDArray[np.float32]) -> NDArray[np.float32]:
         """For which share (n,) of their faces one direction (3,), or one each (n, 3), lies above the face.
 
-        Light from under a face does not reach it, whatever the interpolated normal says: what a renderer shows around
-        a vertex is the mean over its faces of their clipped hemispheres.
+        Light from under a face does not reach it, whatever the interpolated normal says: what a render shows around a
+        vertex is the mean over its faces of their clipped hemispheres. Without this, rough meshes come out too bright
+        (Buddha, 50k vertices, against Cycles: +1.4 %; with it -0.9 %; see benchmarks/against_cycles.py).
         """
         height = np.sum(self.faces[place] * np.atleast_2d(direction)[:, None, :], axis=2)
         return np.sum(self.face_weights[place] * (height > 0.0), axis=1)

@@ -16,15 +16,20 @@ from prt_addon.scene.scene_mesh import SceneMesh
 from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
 
 # Cycles' own noise at these samples: two bakes with other seeds differ by sqrt(2) times it (asserted below).
-SAMPLES = 1024
+SAMPLES = 512
 
 
 @pytest.fixture
 def still_life(scene):
-    """A smooth Suzanne over a floor whose vertices are close, with colours that bleed."""
-    bpy.ops.mesh.primitive_monkey_add(location=(0, 0, 1.0))
+    """A smooth body with a groove over a floor whose vertices are close, with colours that bleed.
+
+    Finely divided: at a coarse smooth-shaded vertex Cycles' bake counts directions under a face by half (its light
+    samples, but not its BSDF samples), which no surface shows.
+    """
+    bpy.ops.mesh.primitive_torus_add(location=(0, 0, 0.7), rotation=(0.5, 0.3, 0.0), major_segments=40, minor_segments=20,
+                                     major_radius=0.6, minor_radius=0.3)
     bpy.ops.object.shade_smooth()
-    bpy.ops.mesh.primitive_grid_add(x_subdivisions=24, y_subdivisions=24, size=4.0)
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=20, y_subdivisions=20, size=4.0)
     bpy.ops.object.shade_smooth()
     for thing, colour in zip(bpy.data.objects, ((0.8, 0.25, 0.1, 1), (0.6, 0.7, 0.8, 1)), strict=True):
         material = bpy.data.materials.new(thing.name)
@@ -64,14 +69,15 @@ def test_radiance_of_a_smooth_environment(still_life, tmp_path, passes, bounces,
     image = smooth_environment()
     containers = baked(bounces)
     for degrees in (0.0, 130.0):
-        environment_world(image, degrees, tmp_path)
+        world = environment_world(image, degrees, tmp_path)
+        world.cycles.sampling_method, world.cycles.sample_map_resolution = "MANUAL", 512  # seconds less, same mean
         ours = np.concatenate([relit(containers[o.name], image, degrees) for o in bpy.data.objects])
         theirs = [np.concatenate([vertex_radiance(o, passes, seed) for o in bpy.data.objects]) for seed in (0, 1)]
         noise = relative_rms(*theirs) / np.sqrt(2.0)
         assert noise < 0.01
         truth = 0.5 * (theirs[0] + theirs[1])
         error = relative_rms(ours, truth)
-        print(f"{sorted(passes)} at {degrees:g} degrees: error {error:.4f}, noise of the mean {noise / 2**0.5:.4f}")
+        print(f"{sorted(passes)} at {degrees:g}: error {error:.4f}, noise of the mean {noise / 2**0.5:.4f}")
         assert error < limit
         # Orientation: any other turn fits far worse.
         turned = np.concatenate([relit(containers[o.name], image, degrees + 90.0) for o in bpy.data.objects])

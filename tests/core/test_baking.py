@@ -35,9 +35,8 @@ def white(directions):
     return np.ones((len(directions), 1, 3))
 
 
-def test_reference_is_one_over_one_minus_albedo_in_a_furnace_with_a_sky():
-    # A convex body in a unit sky: exactly 1 without bounces. A plate over a mirror plate keeps some of it.
-    scene = SceneMesh.assemble([sphere(subdivisions=2)])
+def test_reference_of_a_convex_body_in_a_unit_sky_is_one():
+    scene = SceneMesh.assemble([box()])
     tracer = Tracer(scene.points, scene.triangles, 1)
     receivers = ReceiverSet.of_keys(scene, tracer, np.arange(20))
     radiance = drain(reference_radiance(tracer, scene, receivers, scene.albedo, white, NO_SUNS, 512, -1, 3))
@@ -46,7 +45,7 @@ def test_reference_is_one_over_one_minus_albedo_in_a_furnace_with_a_sky():
 
 def test_reference_of_white_surfaces_returns_all_light():
     # Albedo 1 everywhere and no absorption: every path ends in the sky, radiance is 1 wherever it was emitted.
-    scene = SceneMesh.assemble([plane(size=4.0, cells=2), sphere(centre=(0, 0, 0.9), radius=0.8, subdivisions=2)])
+    scene = SceneMesh.assemble([plane(size=4.0, cells=2), box(low=(-0.5, -0.5, 0.5), high=(0.5, 0.5, 1.0))])
     tracer = Tracer(scene.points, scene.triangles, 1)
     receivers = ReceiverSet.of_keys(scene, tracer, np.arange(9))
     ones = np.ones_like(scene.albedo)
