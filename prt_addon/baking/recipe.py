@@ -29,6 +29,7 @@ from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
 from ..storage.files import load_arrays, save_arrays
 from ..tracing.tracer import Tracer
+from ..transport.buried import buried_receivers, fill_buried
 from ..transport.direct import direct_transfer
 from ..transport.gather import Gather, gather_operator
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
@@ -106,9 +107,10 @@ class _Bake:
                 bounced = yield from self._interreflection(gathered, transfer)
         with self.timer.stage("encode"):
             transfer = self._by_point(receivers, transfer[:, :, None] if bounced is None else bounced.transfer)
+            self._fill_buried(transfer)
             encodings = yield from self._encode(transfer)
         errors: dict[str, Any] = {}
-        if self.settings.error_receivers:
+        if self.settings.error_receivers and len(self.open_keys):
             with self.timer.stage("errors"):
                 errors = yield from self._errors(transfer, encodings)
         return self._result(gathered, bounced, transfer, encodings, errors)
@@ -203,6 +205,13 @@ class _Bake:
         result[receivers.key[front]] = transfer[front]
         return result
 
+    def _fill_buried(self, transfer: NDArray[np.float32]) -> None:
+        """Replace what lies inside other bodies, and keep it out of the error budget: nobody sees it."""
+        white = transfer[self.keys, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
+        buried = buried_receivers(self.tracer, self.scene, self.keys, white)
+        self.filled = fill_buried(self.scene, buried, transfer) if len(buried) else 0
+        self.open_keys = np.setdiff1d(self.keys, buried, assume_unique=True)
+
     def _encode(self, transfer: NDArray[np.float32]) -> Generator[Progress, None, dict[str, Encoding]]:
         """Each target's encoding; a thread encodes while this one reports, so that a bake can be cancelled."""
         encodings: dict[str, Encoding] = {}
@@ -233,7 +242,8 @@ class _Bake:
 
     def _errors(self, transfer: NDArray[np.float32], encodings: dict[str, Encoding],
                 ) -> Generator[Progress, None, dict[str, Any]]:
-        settings, keys = self.settings, choose_receivers(self.keys, self.settings.error_receivers, self.settings.seed)
+        settings = self.settings
+        keys = choose_receivers(self.open_keys, settings.error_receivers, settings.seed)
         compressed = self._compressed(keys, encodings, transfer.shape[1:])
         sample = BakedSample(keys, transfer[keys].astype(np.float64), compressed)
         steps = error_budget(self.tracer, self.scene, self.albedo, sample, self.light or stand_in_light(),
@@ -257,6 +267,9 @@ class _Bake:
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, errors, stability, gathered,
                            bounced, self.light, self.resumed, time.perf_counter() - self.started)
+        if self.filled:
+            note = f"{self.filled} receivers inside other objects take their neighbours' light"
+            report["scene"]["warnings"].append(note)
         shape = (1, *transfer.shape[1:])
         objects = {
             target.name: object_container(self.scene, target, encodings[target.name], shape, self.settings, report,

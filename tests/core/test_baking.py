@@ -60,7 +60,8 @@ def test_reference_sun_on_an_open_plane(angle):
     receivers = ReceiverSet.of_keys(scene, tracer, np.arange(4))
     direction = np.array([[0.6, 0.0, 0.8]])
     suns = DistantSuns(direction, np.array([[5.0, 2.0, 1.0]]), np.array([angle]))
-    radiance = drain(reference_radiance(tracer, scene, receivers, scene.albedo, lambda d: 0.0 * white(d), suns, 4096, 0, 3))
+    steps = reference_radiance(tracer, scene, receivers, scene.albedo, lambda d: 0.0 * white(d), suns, 4096, 0, 3)
+    radiance = drain(steps)
     # Irradiance 5 on a facing plane, cosine 0.8, Lambertian: E cos / pi (a disc above the horizon has the same mean).
     assert np.abs(radiance - 0.8 / np.pi * np.array([5.0, 2.0, 1.0])).max() < 0.02
 

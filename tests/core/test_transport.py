@@ -11,6 +11,7 @@ from prt_addon.basis.directions import quadrature
 from prt_addon.basis.spherical_harmonics import evaluate
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.tracing.tracer import Tracer
+from prt_addon.transport.buried import buried_receivers, fill_buried
 from prt_addon.transport.direct import direct_transfer, unshadowed_transfer
 from prt_addon.transport.gather import gather_operator
 from prt_addon.transport.interreflection import interreflect
@@ -80,6 +81,22 @@ def test_touching_box_leaks_no_light_and_leaves_no_black_rim():
     assert below.any() and np.abs(seen[below]).max() < 1e-6
     sides = (np.abs(scene.normals[:, 2]) < 0.1)
     assert seen[sides].min() > 0.45  # a wall over a plane sees half the sphere's cosine: 0.5
+
+
+def test_receivers_inside_a_body_are_found_and_filled_from_outside():
+    # A floor with a box standing on it: points under the box see only its inside. Its neighbours are in the open.
+    scene = SceneMesh.assemble([plane(size=4.0, cells=16), box(low=(-0.6, -0.6, -0.2), high=(0.6, 0.6, 1))])
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    seen = direct(scene, order=1)[:, 0] * WHITE
+    buried = buried_receivers(tracer, scene, np.arange(len(scene.points)), seen)
+    floor = np.flatnonzero(scene.points[:, 2] == 0)
+    inside = floor[np.abs(scene.points[floor, :2]).max(axis=1) < 0.6]
+    assert set(buried) == set(inside)  # the box's lower corners stick out below the floor: in the open, not buried
+    transfer = seen[:, None, None].astype(np.float32)
+    assert transfer[inside].max() < 1e-6
+    assert fill_buried(scene, buried, transfer) == len(inside) - 1  # all but the innermost of 5 x 5
+    rim = inside[np.abs(scene.points[inside, :2]).max(axis=1) > 0.4]
+    assert transfer[rim].min() > 0.4
 
 
 def test_threads_and_chunks_change_nothing():
