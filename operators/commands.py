@@ -39,7 +39,8 @@ def main(arguments: list[str], output: TextIO | None = None) -> int:
     """Run one command and return its exit code. output: where results go (stdout)."""
     try:
         with _interruptible():
-            parsed = _parser().parse_args(arguments)
+            with contextlib.redirect_stdout(output or sys.stdout):  # argparse prints its help there
+                parsed = _parser().parse_args(arguments)
             for line in parsed.run(parsed):
                 print(line, file=output or sys.stdout, flush=True)
     except SystemExit as end:  # argparse has printed the help

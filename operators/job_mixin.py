@@ -19,9 +19,20 @@ from .properties import assign, session
 POLL_SECONDS = 0.2  # each tick redraws the sidebar
 
 
+# What the stages of the recipe are called on the screen.
+STAGES = {
+    "prepare": "Preparing",
+    "gather": "Finding surfaces that light each other",
+    "direct": "Shadows",
+    "interreflection": "Bounced light",
+    "encode": "Compressing",
+    "errors": "Measuring the error",
+}
+
+
 def progress_text(message: Message) -> str:
-    """A progress message in words: "tracing 42 %, 12 s left"."""
-    text = f"{message['stage']} {100.0 * message['fraction']:.0f} %"
+    """A progress message in words: "Shadows: 42 %, 12 s left"."""
+    text = f"{STAGES.get(message['stage'], message['stage'])}: {100.0 * message['fraction']:.0f} %"
     return text if message["seconds_left"] is None else f"{text}, {message['seconds_left']:.0f} s left"
 
 
@@ -108,7 +119,7 @@ class JobMixin:
         if JobMixin.running is not None:
             raise PRTError("Bake", "another bake is running", "Wait for its end, or cancel it")
         JobMixin.cancel_requested = False
-        assign(session(context), running=True, stage="reading the scene", fraction=0.0, seconds_left=-1.0, message="",
+        assign(session(context), running=True, stage="Reading the scene", fraction=0.0, seconds_left=-1.0, message="",
                failed=False, analysis="")
         JobMixin.running = self.start_job(context)
         return JobMixin.running
@@ -120,7 +131,7 @@ class JobMixin:
         if message["type"] != "progress":
             return
         left = message["seconds_left"]
-        assign(session(context), stage=message["stage"], fraction=message["fraction"],
+        assign(session(context), stage=STAGES.get(message["stage"], message["stage"]), fraction=message["fraction"],
                seconds_left=-1.0 if left is None else left)
         if self._timer is not None:
             context.window_manager.progress_update(message["fraction"])

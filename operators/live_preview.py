@@ -47,7 +47,6 @@ class Live:
 
     shown: dict[str, Shown] = field(default_factory=dict)
     light: NDArray[np.float64] | None = None
-    light_version: int = 0
     signature: Hashable = None
     rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
     light_seconds: float = 0.0

@@ -35,6 +35,7 @@ class PRT_PT_bake(_Sidebar, bpy.types.Panel):
         column.prop(settings, "order")
         column.prop(settings, "bounces")
         if session.running:
+            layout.label(text=session.stage)
             layout.progress(factor=session.fraction, text=_progress(session))
             layout.operator("prt.cancel", icon="CANCEL")
         else:
@@ -101,7 +102,7 @@ def _targets(context: bpy.types.Context) -> str:
 
 
 def _progress(session: bpy.types.PropertyGroup) -> str:
-    text = f"{session.stage}  {100.0 * session.fraction:.0f} %"
+    text = f"{100.0 * session.fraction:.0f} %"
     return text if session.seconds_left < 0.0 else f"{text}, {session.seconds_left:.0f} s left"
 
 

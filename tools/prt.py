@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
-
-import bpy  # noqa: F401  the wheel has to be imported before anything that registers with it
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "prt"
@@ -16,12 +15,21 @@ PACKAGE = "prt"
 
 def load_extension() -> None:
     """Import the checkout as the package `prt`, whatever its folder is called, without a search path."""
+    import bpy  # noqa: F401  the wheel has to be there before the modules it brings are imported
+
     spec = importlib.util.spec_from_file_location(PACKAGE, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
     module = importlib.util.module_from_spec(spec)
     sys.modules[PACKAGE] = module
     spec.loader.exec_module(module)
 
 
+def run(arguments: list[str]) -> int:
+    """Run one command; stdout carries its result alone. Blender's log goes to stderr from the import on."""
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as results:
+        os.dup2(2, 1)
+        load_extension()
+        return importlib.import_module(f"{PACKAGE}.operators.commands").main(arguments, results)
+
+
 if __name__ == "__main__":
-    load_extension()
-    sys.exit(importlib.import_module(f"{PACKAGE}.operators.commands").run_as_program(sys.argv[1:]))
+    sys.exit(run(sys.argv[1:]))

@@ -21,8 +21,8 @@ from .subspaces import Subspaces
 
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
 ROUNDING = 1e-12
-# Signals of at most so many values times clusters get this many random starts beside the splits.
-SMALL, SMALL_STARTS = 1 << 19, 8
+# Random starts beside the splits share a budget of so many values times clusters; no signal gets more than this many.
+START_BUDGET, MOST_STARTS = 1 << 22, 24
 CHUNK = 4096
 
 Progress = Callable[[float], None]
@@ -134,7 +134,7 @@ def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float,
     """
     restarts = settings.restarts
     if restarts is None:
-        restarts = SMALL_STARTS if frame.coordinates.size * settings.clusters <= SMALL else 0
+        restarts = min(START_BUDGET // (frame.coordinates.size * settings.clusters), MOST_STARTS)
     if restarts == 0 or settings.target_error is not None:
         state = split_start(frame, settings, enough)
         iterate(frame, state, settings, enough, report)

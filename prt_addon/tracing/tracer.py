@@ -27,12 +27,14 @@ Result = TypeVar("Result")
 @dataclass(frozen=True)
 class Hits:
     """Nearest hits of n rays. triangle: (n,) int32, -1 for a miss; u, v: barycentric weights of corners 1 and 2;
-    front: (n,) bool, the ray met the side that the triangle winds counter-clockwise on."""
+    front: (n,) bool, the ray met the side that the triangle winds counter-clockwise on; distance: (n,) in tracing space
+    (of world space, divided by the scene's diagonal)."""
 
     triangle: NDArray[np.int32]
     u: NDArray[np.float32]
     v: NDArray[np.float32]
     front: NDArray[np.bool_]
+    distance: NDArray[np.float32]
 
 
 class Tracer:
@@ -66,11 +68,11 @@ class Tracer:
         count = len(origins)
         if self._scene is None or not count:
             nothing = np.zeros(count, np.float32)
-            return Hits(np.full(count, -1, np.int32), nothing, nothing, np.zeros(count, bool))
+            return Hits(np.full(count, -1, np.int32), nothing, nothing, np.zeros(count, bool), nothing)
         found = self._scene.run(origins, directions, query="INTERSECT", output=1)
         # Embree's geometric normal follows the winding, so a ray against it meets the front.
         front = np.sum(found["Ng"] * directions, axis=1) < 0.0
-        return Hits(found["primID"], found["u"], found["v"], front)
+        return Hits(found["primID"], found["u"], found["v"], front, found["tfar"])
 
     def map_in_order(self, work: Callable[[Any], Result], items: Iterable[Any]) -> Iterator[tuple[Any, Result]]:
         """Run `work` on items in threads, yielding (item, result) in the items' order.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Receivers inside other bodies: the floor's points under a wall, the part of an eye inside the head.
+"""Receivers inside or under other bodies: the floor's points below a wall, the part of an eye inside the head.
 
 They are rightly dark, but triangles reach from them out into the open, and interpolation would draw dark teeth along
 every contact. A buried receiver at the rim takes the mean transfer of its neighbours in the open instead (the dilation
@@ -16,10 +16,13 @@ from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from .receiver_set import ReceiverSet, facing_cosines
 
-# Only a receiver that gets less of a white sky than this is looked at: one under a lid is dark, but not buried.
-DARK = 5e-3
-# It is buried if more than this share of its hemisphere shows backs of surfaces: it sees a body from inside.
-BACK_SHARE = 0.5
+# Only a receiver that gets less of a white sky than this is looked at.
+DARK = 0.1
+# It is buried if more than this share of its hemisphere shows backs of surfaces (it sees a body from inside), or another
+# object nearer than NEAR of its own longest edge (a body that touches, or hovers below what the mesh resolves). A
+# crevice of one object stays dark: there the mesh was made to show it.
+SHARE = 0.5
+NEAR = 0.5
 DIRECTIONS = 128
 # Rings of buried receivers that are filled: one reaches every triangle that leaves the body, the second is for the
 # smooth start of what is hidden.
@@ -35,14 +38,38 @@ def buried_receivers(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], 
     receivers = ReceiverSet.of_keys(scene, tracer, dark)
     directions = quadrature(DIRECTIONS, 2)[0].astype(np.float32)
     cosines = facing_cosines(directions, receivers.normals)
-    back = np.zeros(len(receivers))
+    covered = np.zeros(len(receivers))
+    owner, reach = _objects_of_triangles(scene), NEAR * _longest_edges(scene) / tracer.diagonal
+    point = receivers.key % len(scene.points)
+    own = _objects_of_points(scene)[point]
     for index, direction in enumerate(directions):
         facing = np.flatnonzero(cosines[index] > 0.0)
         hits = tracer.nearest(receivers.origins[facing], direction[None, :])
         tracer.rays += len(facing)
-        inside = (hits.triangle >= 0) & ~hits.front
-        back[facing[inside]] += cosines[index, facing[inside]]
-    return np.sort(receivers.key[back > BACK_SHARE * cosines.sum(axis=0)])
+        touching = (owner[hits.triangle] != own[facing]) & (hits.distance < reach[point[facing]])
+        blocked = facing[(hits.triangle >= 0) & (~hits.front | touching)]
+        covered[blocked] += cosines[index, blocked]
+    return np.sort(receivers.key[covered > SHARE * cosines.sum(axis=0)])
+
+
+def _objects_of_triangles(scene: SceneMesh) -> NDArray[np.int32]:
+    return np.repeat(np.arange(len(scene.objects), dtype=np.int32),
+                     [o.triangles.stop - o.triangles.start for o in scene.objects])
+
+
+def _objects_of_points(scene: SceneMesh) -> NDArray[np.int32]:
+    return np.repeat(np.arange(len(scene.objects), dtype=np.int32),
+                     [o.points.stop - o.points.start for o in scene.objects])
+
+
+def _longest_edges(scene: SceneMesh) -> NDArray[np.float64]:
+    """Longest edge (metres) at each point, 0 for loose ones."""
+    corners = scene.points[scene.triangles]
+    lengths = np.sqrt(np.sum((np.roll(corners, -1, axis=1) - corners) ** 2, axis=2))
+    longest = np.zeros(len(scene.points))
+    for corner in range(3):
+        np.maximum.at(longest, scene.triangles[:, corner], np.maximum(lengths[:, corner], lengths[:, corner - 1]))
+    return longest
 
 
 def fill_buried(scene: SceneMesh, buried: NDArray[np.int64], transfer: NDArray[np.float32]) -> int:

@@ -161,7 +161,7 @@ def test_not_worse_than_the_papers_procedure(case: tuple[int, int, int, int, int
     signal = surface_signal(points, values, seed)
     ours = encode(signal, EncoderSettings(clusters, vectors)).squared_error
     # Every run ends in a local minimum by the luck of its start, so it is the middle one of several that must not win.
-    assert ours <= np.median([papers_procedure(signal, clusters, vectors, seed + trial) for trial in range(3)])
+    assert ours <= np.median([papers_procedure(signal, clusters, vectors, trial) for trial in range(5)])
 
 
 def test_order_of_the_methods() -> None:

@@ -99,6 +99,21 @@ def test_receivers_inside_a_body_are_found_and_filled_from_outside():
     assert transfer[rim].min() > 0.4
 
 
+def test_floor_under_a_hovering_body_is_filled_but_a_crevice_stays_dark():
+    # 1 mm between floor and box, floor cells of 25 cm: below what the floor's receivers resolve.
+    scene = SceneMesh.assemble([plane(size=4.0, cells=16), box(low=(-0.6, -0.6, 0.001), high=(0.6, 0.6, 1))])
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    seen = direct(scene, order=1)[:, 0] * WHITE
+    buried = buried_receivers(tracer, scene, np.arange(len(scene.points)), seen)
+    floor = np.flatnonzero(scene.points[:, 2] == 0)
+    assert set(floor[np.abs(scene.points[floor, :2]).max(axis=1) < 0.6]) <= set(buried)
+    # The same two bodies as one object are a crevice that the artist modelled.
+    one = SceneMesh.assemble([join("one", plane(size=4.0, cells=16),
+                                   box(low=(-0.6, -0.6, 0.001), high=(0.6, 0.6, 1)))])
+    seen = direct(one, order=1)[:, 0] * WHITE
+    assert not len(buried_receivers(Tracer(one.points, one.triangles, 1), one, np.arange(len(one.points)), seen))
+
+
 def test_threads_and_chunks_change_nothing():
     scene = SceneMesh.assemble([plane(size=4.0, cells=16), sphere(centre=(0, 0, 1.2))])
     one = direct(scene, order=4, count=512, threads=1)

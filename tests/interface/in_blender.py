@@ -21,10 +21,11 @@ import numpy as np
 
 MODULE = "bl_ext.user_default.prt"
 OUTPUT, SCENE = (Path(text) for text in sys.argv[sys.argv.index("--") + 1:][:2])
-# Share of a bake's time that may pass between two timer calls: a bake that blocks has 1. In seconds it can't be said, as
+# Share of a bake's time that may pass between two timer calls: a bake that blocks has 1. Seconds would say nothing, as
 # software drawing on a loaded machine takes over a second per frame.
 LONGEST_FREEZE = 0.4
 BAKE_SECONDS = 180.0
+DRAWN = 3.0  # seconds after which a change is on the screen, even there
 ALL = {"Statue", "Floor", "Wall"}
 
 Step = Generator[float]
@@ -226,9 +227,13 @@ def preview() -> Step:
     on = view(shoot("07_preview_on"))
     assert session().preview and not session().preview_message, session().preview_message
     assert np.abs(on - off).mean() > 2.0, "switching the preview on changes nothing"
+    area().spaces.active.shading.type = "MATERIAL"
+    yield 2.0 * DRAWN
+    shoot("07_preview_on_material")
+    area().spaces.active.shading.type = "SOLID"
     with override():
         bpy.ops.prt.toggle_preview()
-    yield 1.0
+    yield DRAWN
     again = view(shoot("08_preview_off_again"))
     assert np.abs(again - off).mean() < 0.5, "the preview leaves traces"
     with override():
@@ -240,26 +245,26 @@ def follow_light() -> Step:
     """Sun, HDRI, strength, exposure: the picture follows without a click."""
     before = view(shoot("09_light_before"))
     bpy.data.objects["Sun"].rotation_euler = (1.2, 0.0, -2.0)
-    yield 1.0
+    yield DRAWN
     sun = view(shoot("10_sun_moved"))
     assert np.abs(sun - before).mean() > 1.0, "moving the Sun changes nothing"
     mapping = next(n for n in bpy.context.scene.world.node_tree.nodes if n.type == "MAPPING")
     mapping.inputs["Rotation"].default_value[2] = 2.5
-    yield 1.0
+    yield DRAWN
     turned = view(shoot("11_hdri_turned"))
     assert np.abs(turned - sun).mean() > 1.0, "turning the HDRI changes nothing"
     bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.2
-    yield 1.0
+    yield DRAWN
     darker = view(shoot("12_strength"))
     assert darker.mean() < turned.mean(), "a weaker World is not darker"
     bpy.context.scene.prt.exposure = 2.0
-    yield 1.0
+    yield DRAWN
     brighter = view(shoot("13_exposure"))
     assert brighter.mean() > darker.mean(), "exposure does not brighten"
     bpy.context.scene.prt.exposure = 0.0
     bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 1.0
     bpy.data.lights["Sun"].energy = 0.0
-    yield 1.0
+    yield DRAWN
     no_sun = view(shoot("14_no_sun"))
     assert np.abs(no_sun - turned).mean() > 0.5, "the Sun's strength does nothing"
 
