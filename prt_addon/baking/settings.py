@@ -32,7 +32,7 @@ class BakeSettings:
     """
 
     order: int = 5
-    directions: int = 1024
+    directions: int = 2048
     gather_directions: int = 256
     bounces: int = -1
     bounce_error: float = 1e-3

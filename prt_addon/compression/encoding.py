@@ -22,7 +22,7 @@ from .subspaces import Subspaces
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
 ROUNDING = 1e-12
 # Random starts beside the splits share a budget of so many values times clusters; no signal gets more than this many.
-START_BUDGET, MOST_STARTS = 1 << 22, 24
+START_BUDGET, MOST_STARTS = 1 << 22, 12
 CHUNK = 4096
 
 Progress = Callable[[float], None]

@@ -26,8 +26,8 @@ def still_life(scene):
     Finely divided: at a coarse smooth-shaded vertex Cycles' bake counts directions under a face by half (its light
     samples, but not its BSDF samples), which no surface shows.
     """
-    bpy.ops.mesh.primitive_torus_add(location=(0, 0, 0.7), rotation=(0.5, 0.3, 0.0), major_segments=40, minor_segments=20,
-                                     major_radius=0.6, minor_radius=0.3)
+    bpy.ops.mesh.primitive_torus_add(location=(0, 0, 0.7), rotation=(0.5, 0.3, 0.0), major_segments=40,
+                                     minor_segments=20, major_radius=0.6, minor_radius=0.3)
     bpy.ops.object.shade_smooth()
     bpy.ops.mesh.primitive_grid_add(x_subdivisions=20, y_subdivisions=20, size=4.0)
     bpy.ops.object.shade_smooth()

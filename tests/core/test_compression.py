@@ -156,12 +156,13 @@ def test_update_converges_to_the_svd_and_never_raises_the_error() -> None:
 
 
 @pytest.mark.parametrize("case", [(1200, 16, 12, 2, 0), (1200, 16, 12, 2, 1), (900, 9, 20, 1, 2), (900, 25, 10, 4, 3)])
-def test_not_worse_than_the_papers_procedure(case: tuple[int, int, int, int, int]) -> None:
+def test_not_worse_than_the_papers_typical_run(case: tuple[int, int, int, int, int]) -> None:
     points, values, clusters, vectors, seed = case
     signal = surface_signal(points, values, seed)
     ours = encode(signal, EncoderSettings(clusters, vectors)).squared_error
-    # Every run ends in a local minimum by the luck of its start, so it is the middle one of several that must not win.
-    assert ours <= np.median([papers_procedure(signal, clusters, vectors, trial) for trial in range(5)])
+    # Every run, theirs and ours, ends in a local minimum by the luck of its start (22 to 34 over 30 seeds in the third
+    # case), so a single lucky run of theirs may be lower: it is the middle one of many that must not win.
+    assert ours <= np.median([papers_procedure(signal, clusters, vectors, trial, 10) for trial in range(15)])
 
 
 def test_order_of_the_methods() -> None:
