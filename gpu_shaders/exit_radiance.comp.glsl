@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
 // Exit radiance of one (point, row) per invocation: mean + sum of weights times basis vectors, each already multiplied
 // by the light (clustered PCA, Sloan et al. 2003, section 6).
 //

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
 // Radiance and albedo are interpolated apart and multiplied here, so a texture's edge stays sharp under smooth light.
 // Truncated lighting can ring below zero, and a view transform of negative values is undefined: clip at black.
 void main()

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
 // A baked surface: the point's exit radiance for unit albedo is found by the vertex number.
 void main()
 {

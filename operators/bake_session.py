@@ -26,7 +26,9 @@ from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
 from ..prt_addon.blender.visibility import find_objects
+from ..prt_addon.errors import BadScene, StorageError
 from ..prt_addon.scene.scene_mesh import SceneMesh
+from ..prt_addon.storage.container import BakedTransfer
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 KEPT_DAYS = 14
@@ -87,6 +89,7 @@ class BakeSession:
     job: Path
     process: BakeProcess
     started: float
+    scene_name: str
     digests: dict[str, dict[str, str | None]]
     surroundings: dict[str, str]
 
@@ -99,15 +102,16 @@ class BakeSession:
         started = time.monotonic()
         scene = read_scene(depsgraph, settings, targets)
         names = [o.name for o in scene.objects if o.is_target]
-        digests = {name: fingerprint(found, depsgraph)
-                   for name, found in zip(names, find_objects(names, depsgraph.scene), strict=True)}
+        targets_found = find_objects(names, depsgraph.scene)
+        _check_storable(targets_found)
+        digests = {name: fingerprint(found, depsgraph) for name, found in zip(names, targets_found, strict=True)}
         geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
         folder = jobs_folder()
         _drop_forgotten(folder)
         job = jobs.write_job(folder, scene, settings, reference_light(depsgraph), geometry)
         process = BakeProcess([sys.executable, *bpy.app.python_args], job)
         process.start()
-        return BakeSession(job, process, started, digests, surroundings(depsgraph))
+        return BakeSession(job, process, started, depsgraph.scene.name, digests, surroundings(depsgraph))
 
     @property
     def seconds(self) -> float:
@@ -121,14 +125,30 @@ class BakeSession:
         are replaced or none. The job folder stays, so that nothing is lost if the file can't be saved.
         """
         result = jobs.read_result(self.job)
+        scene = bpy.data.scenes.get(self.scene_name)
+        if scene is None:
+            raise BadScene(self.scene_name, "the scene was removed or renamed while its bake ran", "Undo that")
         names = list(result.objects)
-        for scene_object, name in zip(find_objects(names, bpy.context.scene), names, strict=True):
-            write_baked(scene_object, result.objects[name], self.digests[name], self.surroundings)
+        for scene_object, name in zip(find_objects(names, scene), names, strict=True):
+            write_baked(scene_object, _with_source(result.objects[name]), self.digests[name], self.surroundings)
         return result
 
     def discard(self) -> None:
         """Drop the job folder."""
         jobs.discard(self.job)
+
+
+def _with_source(baked: BakedTransfer) -> BakedTransfer:
+    """The bake with what storing asks: whether its points are the vertices of the evaluated mesh."""
+    return replace(baked, header={**baked.header, "source": {"on_source_mesh": baked.header["matches_source"]}})
+
+
+def _check_storable(targets: list[bpy.types.Object]) -> None:
+    """Raise StorageError, before the work, for a target whose data another file owns."""
+    for target in targets:
+        if target.library is not None or target.override_library is not None:
+            raise StorageError(target.name, "it is linked from another file, so its bake can't be stored here",
+                               "Make it local, select other objects, or bake it in its own file")
 
 
 def _drop_forgotten(folder: Path) -> None:

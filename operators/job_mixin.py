@@ -98,26 +98,26 @@ class JobMixin:
             JobMixin.cancel_requested = True
         elif event.type != "TIMER":
             return {"PASS_THROUGH"}
+        under_way = False
         try:
             if job is None or JobMixin.cancel_requested:
                 raise Cancelled("Bake", "cancelled, nothing was changed", "Bake again to resume where it stopped")
             for message in job.process.poll()[-1:]:  # the last says it all: it alone can be an end
                 self._show(context, message)
-            if not job.process.finished:
-                return {"PASS_THROUGH"}
-            result = self._complete(context, job)
+            under_way = not job.process.finished
+            return {"PASS_THROUGH"} if under_way else self._complete(context, job)
         except PRTError as error:
-            result = self._fail(context, error)
-        self._end(context)
-        return result
+            return self._fail(context, error)
+        finally:
+            if not under_way:
+                self._end(context)
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender drops the operator: a window closes, a file is loaded."""
         self._end(context)
 
     def _begin(self, context: bpy.types.Context) -> BakeSession:
-        if JobMixin.running is not None:
-            raise PRTError("Bake", "another bake is running", "Wait for its end, or cancel it")
+        """Start the job. That no other one runs is the subclass's `poll` to see to."""
         JobMixin.cancel_requested = False
         assign(session(context), running=True, stage="Reading the scene", fraction=0.0, seconds_left=-1.0, message="",
                failed=False, analysis="")

@@ -28,6 +28,7 @@ from .properties import assign, session
 
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
+NOTE_WAIT = 1.0  # after a redraw was asked for, its outcome is known
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
 
@@ -185,6 +186,15 @@ def _catch_up() -> None:
     finally:
         _live.working = False
     viewport.redraw()
+    if not bpy.app.timers.is_registered(_note_viewport):
+        bpy.app.timers.register(_note_viewport, first_interval=NOTE_WAIT, persistent=True)
+
+
+def _note_viewport() -> None:
+    """Pass on what the draw handlers ran into: they run while Blender draws and can't write properties themselves."""
+    status = viewport.status()
+    fallback = "" if status.colour_managed else f"Colours are approximate: {status.fallback}"
+    assign(session(), viewport_message=status.error or fallback)
 
 
 @persistent
@@ -240,7 +250,8 @@ def unregister() -> None:
     """Leave no handler, timer or GPU object behind."""
     for handlers, handler in HANDLERS:
         handlers.remove(handler)
-    if bpy.app.timers.is_registered(_catch_up):
-        bpy.app.timers.unregister(_catch_up)
+    for timer in (_catch_up, _note_viewport):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
     viewport.disable()
     _live.shown.clear()

@@ -29,6 +29,11 @@ def _take_preset(settings: PRTSettings, _context: bpy.types.Context) -> None:
     settings.order = PRESETS[settings.preset].order
 
 
+def _redraw(_settings: PRTSettings, _context: bpy.types.Context) -> None:
+    """What the viewport shows depends on this setting; Blender does not know."""
+    redraw("WINDOW")
+
+
 class PRTSettings(bpy.types.PropertyGroup):
     """Settings of the bake and of the preview: Scene.prt."""
 
@@ -47,7 +52,7 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "the shadows",
     )
     exposure: FloatProperty(
-        name="Exposure", default=0.0, soft_min=-5.0, soft_max=5.0, step=10, precision=2,
+        name="Exposure", update=_redraw, default=0.0, soft_min=-5.0, soft_max=5.0, step=10, precision=2,
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
     )
 
@@ -77,6 +82,7 @@ class PRTSession(bpy.types.PropertyGroup):
     failed: BoolProperty()
     preview: BoolProperty()
     preview_message: StringProperty()
+    viewport_message: StringProperty()
     objects: CollectionProperty(type=PRTBakedObject)
     analysis: StringProperty()
 
@@ -92,16 +98,16 @@ def assign(owner: bpy.types.PropertyGroup, **values: object) -> None:
     for name, value in changed.items():
         setattr(owner, name, value)
     if changed:
-        redraw_sidebars()
+        redraw("UI")
 
 
-def redraw_sidebars() -> None:
-    """Have the sidebar of every 3D viewport drawn anew: writing a session property alone does not."""
+def redraw(kind: str) -> None:
+    """Have a kind of region (UI: the sidebar, WINDOW: the picture) of every 3D viewport drawn anew."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 for region in area.regions:
-                    if region.type == "UI":
+                    if region.type == kind:
                         region.tag_redraw()
 
 

@@ -65,7 +65,7 @@ class PRT_PT_preview(_Sidebar, bpy.types.Panel):
         column = layout.column()
         column.active = session.preview
         column.prop(context.scene.prt, "exposure")
-        for line in session.preview_message.splitlines():
+        for line in (*session.preview_message.splitlines(), *session.viewport_message.splitlines()):
             _wrapped(layout, context, line, "INFO")
 
 
@@ -90,7 +90,7 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
             if details:
                 column.label(text=", ".join(details), icon="BLANK1")
             if line.stale:
-                _wrapped(column, context, line.stale, "BLANK1", alert=True)
+                _wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
         if len(session.objects) > ROWS:
             column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
         layout.operator("prt.clear", icon="TRASH")

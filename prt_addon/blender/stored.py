@@ -76,21 +76,19 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
     if mesh.is_editmode:
         raise StorageError(scene_object.name, "its baked data can't be read in edit mode", "Leave edit mode")
     header = container.parse_header(mesh[container.HEADER_PROPERTY], scene_object.name)
-    cluster = _read_attribute(mesh, container.CLUSTER_ATTRIBUTE, scene_object.name)
+    cluster = _read_attribute(mesh, container.CLUSTER_ATTRIBUTE, 1, scene_object.name)
     vectors = header["shape"][1] - 1
-    weights = [_read_attribute(mesh, f"{container.WEIGHTS_ATTRIBUTE}{k}", scene_object.name)
+    weights = [_read_attribute(mesh, f"{container.WEIGHTS_ATTRIBUTE}{k}", 4, scene_object.name)
                for k in range(-(-vectors // 4))]
-    albedo = _read_attribute(mesh, container.ALBEDO_ATTRIBUTE, scene_object.name)[:, :3]
-    normals = _read_attribute(mesh, NORMAL_ATTRIBUTE, scene_object.name)
-    bases = mesh.get(container.BASES_PROPERTY)
-    if bases is None:
-        raise StorageError(scene_object.name, "its baked data has no bases", container.REBAKE)
+    albedo = _read_attribute(mesh, container.ALBEDO_ATTRIBUTE, 3, scene_object.name)[:, :3]
+    normals = _read_attribute(mesh, NORMAL_ATTRIBUTE, 3, scene_object.name)[:, :3]
+    bases = _read_bases(mesh, scene_object.name)
     matrix = _header_matrix(header, scene_object.name)
     arrays = read_mesh(mesh)
     world = transform_rows(arrays.positions, matrix[:3, :3]) + matrix[:3, 3]
     triangles = arrays.triangles[:, [0, 2, 1]] if _mirrors(matrix) else arrays.triangles
     geometry = (albedo, world, _unit_rows(transform_rows(normals, normal_matrix(matrix))), triangles)
-    return container.unpack(header, cluster, weights, np.array(bases, np.float32), geometry, scene_object.name)
+    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name)
 
 
 def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
@@ -145,7 +143,7 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     header = stored_header(scene_object)
     if header is None:
         return None
-    digests = header.get("digests", {})
+    digests = _stored_digests(header, scene_object.name)
     geometry = geometry_digest(scene_object, depsgraph)
     if geometry is not None and digests.get("geometry") != geometry:
         return "its mesh or modifiers changed since the bake"
@@ -154,6 +152,13 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     if digests.get("materials") != material_digest(used_materials(scene_object)):
         return "its materials changed since the bake"
     return _changed_surroundings(digests.get("surroundings"), surroundings, scene_object.name_full)
+
+
+def _stored_digests(header: dict, subject: str) -> dict:
+    digests = header.get("digests", {})
+    if not isinstance(digests, dict) or not isinstance(digests.get("surroundings") or {}, dict):
+        raise StorageError(subject, "the header of its baked data states no valid digests", container.REBAKE)
+    return digests
 
 
 def _changed_surroundings(then: dict[str, str] | None, now: dict[str, str] | None, own_name: str) -> str | None:
@@ -180,10 +185,12 @@ def _bake_matrix(baked: BakedTransfer, scene_object: bpy.types.Object) -> NDArra
 
 def _header_matrix(header: dict, subject: str) -> NDArray[np.float64]:
     """(4, 4) from the header's 16 numbers, row by row."""
-    numbers = np.asarray(header.get("matrix", ()), np.float64).ravel()
-    if numbers.size != 16 or not np.isfinite(numbers).all():
+    numbers = header.get("matrix")
+    valid = isinstance(numbers, list) and len(numbers) == 16 and all(type(n) in (int, float) for n in numbers)
+    matrix = np.array(numbers if valid else [np.nan] * 16, np.float64).reshape(4, 4)
+    if not np.isfinite(matrix).all() or is_flattened(matrix):
         raise StorageError(subject, "the header of its baked data states no valid transform", container.REBAKE)
-    return numbers.reshape(4, 4)
+    return matrix
 
 
 def _mirrors(matrix: NDArray[np.float64]) -> bool:
@@ -244,6 +251,7 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
 
 MEMBERS = {"INT": ("value", 1, np.int32), "FLOAT4": ("vector", 4, np.float32),
            "FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT_COLOR": ("color", 4, np.float32)}
+NOTHING = ("", 0, np.float32)  # of an attribute that is not there, or of a kind that never was ours
 
 
 def _write_attribute(mesh: bpy.types.Mesh, name: str, kind: str, values: NDArray) -> None:
@@ -256,15 +264,27 @@ def _write_attribute(mesh: bpy.types.Mesh, name: str, kind: str, values: NDArray
     attribute.data.foreach_set(member, np.ascontiguousarray(values, dtype).ravel())
 
 
-def _read_attribute(mesh: bpy.types.Mesh, name: str, subject: str) -> NDArray:
+def _read_attribute(mesh: bpy.types.Mesh, name: str, least_width: int, subject: str) -> NDArray:
+    """Values (p,) or (p, width); a conversion that keeps at least `least_width` numbers per point loses nothing."""
     attribute = mesh.attributes.get(name)
-    if attribute is None or attribute.domain != "POINT" or attribute.data_type not in MEMBERS:
+    member, width, dtype = MEMBERS.get(attribute.data_type, NOTHING) if attribute is not None else NOTHING
+    if attribute is None or attribute.domain != "POINT" or width < least_width or (width > 1) != (least_width > 1):
         raise StorageError(subject, f"the attribute {name} of its baked data is missing or was converted",
                            container.REBAKE)
-    member, width, dtype = MEMBERS[attribute.data_type]
     values = np.empty(len(attribute.data) * width, dtype)
     attribute.data.foreach_get(member, values)
     return values if width == 1 else values.reshape(-1, width)
+
+
+def _read_bases(mesh: bpy.types.Mesh, subject: str) -> NDArray[np.float32]:
+    """The flattened bases. Raises StorageError where the property is missing or was replaced by something else."""
+    bases = mesh.get(container.BASES_PROPERTY)
+    if bases is None:
+        raise StorageError(subject, "its baked data has no bases", container.REBAKE)
+    try:
+        return np.array(bases, np.float32)
+    except (TypeError, ValueError) as error:
+        raise StorageError(subject, "the bases of its baked data are no numbers", container.REBAKE) from error
 
 
 def _clear_mesh(mesh: bpy.types.Mesh) -> None:

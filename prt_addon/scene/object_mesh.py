@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from ..errors import BadScene
 
+# Metres; beyond, squares and cubes of lengths leave single precision, and Blender clamps coordinates at 3e38.
+FARTHEST = 1e18
+
 
 @dataclass(frozen=True)
 class ObjectMesh:
@@ -47,6 +50,13 @@ def clean(mesh: ObjectMesh, warnings: list[str]) -> ObjectMesh:
     if bad.any():
         raise BadScene(mesh.name, f"{int(bad.sum())} vertices have no finite coordinates",
                        "Delete them, or mend the modifier that makes them")
+    far = np.abs(mesh.positions).max(axis=1, initial=0.0) > FARTHEST
+    if far.any():
+        raise BadScene(mesh.name, f"{int(far.sum())} vertices lie more than {FARTHEST:.0e} m away",
+                       "Delete them, or mend the modifier or the scale that puts them there")
+    uncoloured = int((~np.isfinite(mesh.corner_albedo).all(axis=(1, 2))).sum())
+    if uncoloured:
+        raise BadScene(mesh.name, f"the colour of {uncoloured} triangles is not a number", "Mend its materials' colours")
     if not len(mesh.triangles):
         if mesh.is_target:
             raise BadScene(mesh.name, "the mesh has no faces", "Add faces, or bake another object")

@@ -136,7 +136,7 @@ def _split(mesh: ObjectMesh, longest_edge: float, warnings: list[str]) -> _Part:
     normals = _mean_per_group(mesh.corner_normals.reshape(-1, 3), group, count)
     length = np.sqrt(np.sum(normals ** 2, axis=1))
     triangles = group.reshape(-1, 3).astype(np.int32)
-    degenerate = length < 1e-6
+    degenerate = ~(length >= 1e-6)  # NaN among them
     normals[~degenerate] /= length[~degenerate, None]
     _replace_normals(points, triangles, normals, degenerate)
     albedo = np.clip(_mean_per_group(mesh.corner_albedo.reshape(-1, 3), group, count), 0.0, 1.0)

@@ -72,7 +72,7 @@ def check_header(header: Any, subject: str) -> dict[str, Any]:
         raise StorageError(subject, f"its baked data has schema {header['schema']}, this version reads up to {SCHEMA}",
                            "Update the extension, or bake the object again")
     shape = header.get("shape")
-    if not (isinstance(shape, list) and len(shape) == 5 and all(isinstance(s, int) and s > 0 for s in shape)):
+    if not (isinstance(shape, list) and len(shape) == 5 and all(type(s) is int and s > 0 for s in shape)):
         raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
     return header
 
@@ -106,6 +106,8 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
     points, vectors = len(cluster), representatives - 1
     albedo, positions, normals, triangles = geometry
     expected = clusters * representatives * rows * columns * channels
+    if channels not in (1, 3) or round(columns ** 0.5) ** 2 != columns:
+        raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
     if flat_bases.size != expected:
         raise StorageError(subject, f"its bases hold {flat_bases.size} numbers instead of {expected}", REBAKE)
     if len(packed_weights) != -(-vectors // 4) or any(w.shape != (points, 4) for w in packed_weights):
@@ -116,7 +118,7 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
         raise StorageError(subject, "a cluster index is out of range", REBAKE)
     weights = np.concatenate([*packed_weights, np.zeros((points, 0), np.float32)], axis=1)[:, :vectors]
     bases = np.asarray(flat_bases, np.float32).reshape(clusters, representatives, rows, columns, channels)
-    if not (np.isfinite(bases).all() and np.isfinite(weights).all()):
+    if not all(np.isfinite(values).all() for values in (bases, weights, albedo, positions, normals)):
         raise StorageError(subject, "its baked data holds values that are not finite", REBAKE)
     return BakedTransfer(header, np.asarray(cluster, np.int32), np.asarray(weights, np.float32), bases,
                          np.asarray(albedo, np.float32), np.asarray(positions, np.float32),

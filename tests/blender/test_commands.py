@@ -19,7 +19,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 TOOL = ROOT / "tools" / "prt.py"
-FAST = ["--preset", "draft", "--set", "directions=64", "--set", "gather_directions=32", "--set", "error_receivers=0"]
+FAST = ["--preset", "draft", "--set", "directions=64", "--set", "gather_directions=32", "--set", "spacing=0",
+        "--set", "error_receivers=0"]
 
 if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads it, without registering anything
     sys.modules["prt"] = types.ModuleType("prt")
@@ -120,6 +121,19 @@ def test_relight_adds_suns_only_when_asked(baked: Path, tmp_path: Path) -> None:
 def test_rotation_of_a_uniform_sky_changes_nothing(baked: Path, tmp_path: Path) -> None:
     turned = relit(baked, tmp_path / "b.npz", "--rotate", "77.5")
     assert turned["radiance"] == pytest.approx(relit(baked, tmp_path / "a.npz")["radiance"], abs=1e-4)
+
+
+def test_data_sits_where_the_contract_says(baked: Path) -> None:
+    """The receivers are the vertices here, so everything is on the objects' own meshes."""
+    bpy.ops.wm.open_mainfile(filepath=str(baked))
+    mesh = bpy.data.objects["Ball"].data
+    header = json.loads(mesh["prt_header"])
+    clusters, representatives, *_ = header["shape"]
+    weights = [a for a in mesh.attributes if a.name.startswith("prt_weights_")]
+    assert mesh.attributes["prt_cluster"].data_type == "INT" and mesh.attributes["prt_cluster"].domain == "POINT"
+    assert len(weights) == -(-(representatives - 1) // 4) and {a.data_type for a in weights} == {"FLOAT4"}
+    assert len(mesh["prt_bases"]) == np.prod(header["shape"]) and clusters >= 1
+    assert not [o for o in bpy.data.objects if o.name.startswith("PRT ")]
 
 
 def test_report_and_export(baked: Path, tmp_path: Path) -> None:

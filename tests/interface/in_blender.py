@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -150,7 +151,7 @@ def analyze() -> Step:
     with override():
         assert bpy.ops.prt.analyze() == {"FINISHED"}
     assert session().analysis
-    yield 1.0
+    yield DRAWN
     shoot("02_analysis")
     assert carrier("Statue") is None
 
@@ -217,6 +218,21 @@ def cancel() -> Step:
     bpy.context.scene.prt.preset = "draft"
 
 
+def survive_crash() -> Step:
+    """The bake process dies: Blender lives, one message says what happened, and the previous bake stays."""
+    before = carrier("Statue")["prt_header"]
+    bpy.context.scene.prt.preset = "high"
+    assert invoke_bake() == {"RUNNING_MODAL"}
+    yield 1.0
+    os.kill(children()[0], signal.SIGKILL)
+    yield from until(lambda: not session().running, "the bake still runs without its process")
+    assert session().failed and "ended by signal SIGKILL" in session().message, session().message
+    assert carrier("Statue")["prt_header"] == before
+    yield DRAWN
+    shoot("05_crashed")
+    bpy.context.scene.prt.preset = "draft"
+
+
 def preview() -> Step:
     """The preview changes the picture, and Blender's own returns with it off."""
     yield 1.0
@@ -267,6 +283,14 @@ def follow_light() -> Step:
     yield DRAWN
     no_sun = view(shoot("14_no_sun"))
     assert np.abs(no_sun - turned).mean() > 0.5, "the Sun's strength does nothing"
+    lamp = bpy.data.lights["Sun"]
+    lamp.keyframe_insert("energy", frame=1)
+    lamp.energy = 4.0
+    lamp.keyframe_insert("energy", frame=20)
+    bpy.context.scene.frame_set(20)
+    yield DRAWN
+    assert np.abs(view(shoot("14_frame_20")) - no_sun).mean() > 0.5, "an animated Sun is not followed"
+    bpy.context.scene.frame_set(1)
 
 
 def warn_stale() -> Step:
@@ -333,8 +357,8 @@ def disable() -> Step:
     shoot("18_enabled_again")
 
 
-STEPS = (open_scene, analyze, bake, undo_and_redo, bake_all, cancel, preview, follow_light, warn_stale, survive_reload,
-         load_during_bake, clear, disable)
+STEPS = (open_scene, analyze, bake, undo_and_redo, bake_all, cancel, survive_crash, preview, follow_light, warn_stale,
+         survive_reload, load_during_bake, clear, disable)
 
 
 def run_steps(steps: tuple[Callable[[], Step], ...]) -> Iterator[float]:
