@@ -20,7 +20,7 @@ from ..lighting.windowing import remove_ringing
 from ..storage.digests import digest_arrays
 from .nodes import constant_of, source_of
 from .visibility import render_visible_objects
-from .world import EnvironmentSource, read_environment, read_environment_file
+from .world import EnvironmentSource, check_strength, read_environment, read_environment_file
 
 
 @dataclass(frozen=True)
@@ -132,9 +132,10 @@ def _add(found: list[SunLight], lamp: bpy.types.Object, matrix: NDArray[np.float
     if not data.normalize and angle > 0.0:
         # Without normalising the strength is the disc's radiance (lighting/analytic.py).
         colour = colour * np.pi * np.sin(angle / 2.0) ** 2
+    check_strength(lamp.name, colour)
     direction = matrix[:3, 2]  # a lamp shines along its own -Z
     length = float(np.sqrt(np.sum(direction ** 2)))
-    if length > 0.0 and np.any(colour != 0.0):
+    if 0.0 < length < np.inf and np.any(colour != 0.0):
         found.append(SunLight(lamp.name, direction / length, colour, angle))
 
 

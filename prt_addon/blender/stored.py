@@ -156,7 +156,7 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
 
 def _stored_digests(header: dict, subject: str) -> dict:
     digests = header.get("digests", {})
-    if not isinstance(digests, dict) or not isinstance(digests.get("surroundings") or {}, dict):
+    if not isinstance(digests, dict) or not isinstance(digests.get("surroundings"), dict | None):
         raise StorageError(subject, "the header of its baked data states no valid digests", container.REBAKE)
     return digests
 

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PRTError
+from ..errors import BadScene, PRTError
 from ..lighting.environment import band_energies, check_finite, load_equirectangular, project, total_energy
 from ..lighting.reference_light import REFERENCE_WIDTH, averaged
 from .nodes import constant_of, signature, source_of, walk
@@ -22,6 +22,7 @@ CACHED = 8  # projected environments kept: some kilobytes each
 LINEAR = {"Linear Rec.709", "Non-Color"}
 CHOOSE_IMAGE = "Put it back, or choose another image in the World"
 IDENTITY = np.eye(3)
+STRONGEST = 1e30  # products with transfer still fit single precision
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,14 @@ def _plain(name: str, kind: str, colour: NDArray[np.float64], warnings: tuple[st
     return EnvironmentSource(name, kind, white, colour, warnings=warnings)
 
 
+def check_strength(subject: str, values: Iterable[float]) -> None:
+    """Raise BadScene where a light's colours or strength are no numbers to reckon with in single precision."""
+    if not all(abs(value) <= STRONGEST for value in values):  # also catches NaN
+        raise BadScene(subject, f"its colour or strength is not a number below {STRONGEST:.0e}", "Lower its strength")
+
+
 def _coloured(world: bpy.types.World, colour: tuple[float, ...]) -> EnvironmentSource:
+    check_strength(f"World {world.name}", colour)
     black = not any(colour)
     warnings = (f"World {world.name}: it is black and gives no light",) if black else ()
     return _plain(world.name, "none" if black else "colour", np.array(colour[:3], np.float64), warnings)
@@ -122,6 +130,7 @@ def _fast(world: bpy.types.World, surface: bpy.types.Node) -> EnvironmentSource 
         return None
     if colour is not None:
         return _coloured(world, tuple(strength * c for c in colour[:3]))
+    check_strength(f"World {world.name}", (strength,))
     texture = source_of(surface.inputs["Color"])
     rotation = _lookup_rotation(texture) if _is_plain_hdri(texture) else None
     if rotation is None:
@@ -220,7 +229,7 @@ def _check_images(world: bpy.types.World, output: bpy.types.Node) -> None:
 
 
 def _path_of(image: bpy.types.Image) -> str:
-    return bpy.path.abspath(image.filepath, library=image.library) if image.filepath else ""
+    return os.path.normpath(bpy.path.abspath(image.filepath, library=image.library)) if image.filepath else ""
 
 
 def _image_key(image: bpy.types.Image) -> Hashable:

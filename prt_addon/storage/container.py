@@ -106,7 +106,9 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
     points, vectors = len(cluster), representatives - 1
     albedo, positions, normals, triangles = geometry
     expected = clusters * representatives * rows * columns * channels
-    if channels not in (1, 3) or round(columns ** 0.5) ** 2 != columns:
+    rows_of = header.get("rows")
+    diffuse = isinstance(rows_of, dict) and rows_of.get("kind") == "constant"
+    if channels not in (1, 3) or round(columns ** 0.5) ** 2 != columns or (diffuse and rows != 1):
         raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
     if flat_bases.size != expected:
         raise StorageError(subject, f"its bases hold {flat_bases.size} numbers instead of {expected}", REBAKE)

@@ -18,9 +18,9 @@ from .receiver_set import ReceiverSet, facing_cosines
 
 # Only a receiver that gets less of a white sky than this is looked at.
 DARK = 0.1
-# It is buried if more than this share of its hemisphere shows backs of surfaces (it sees a body from inside), or another
-# object nearer than NEAR of its own longest edge (a body that touches, or hovers below what the mesh resolves). A
-# crevice of one object stays dark: there the mesh was made to show it.
+# It is buried if more than this share of its hemisphere shows backs of surfaces (it sees a body from inside), or
+# another object nearer than NEAR of its own longest edge (a body that touches, or hovers below what the mesh resolves).
+# A crevice of one object stays dark: there the mesh was made to show it.
 SHARE = 0.5
 NEAR = 0.5
 DIRECTIONS = 128

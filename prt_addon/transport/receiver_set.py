@@ -83,7 +83,7 @@ class ReceiverSet:
         height += np.take(self.faces[:, :, 1], place, axis=0) * y
         height += np.take(self.faces[:, :, 2], place, axis=0) * z
         above = (height > 0.0).astype(np.float32)
-        return np.vecdot(above, np.take(self.face_weights, place, axis=0))
+        return np.vecdot(above, np.take(self.face_weights, place, axis=0))  # small
 
     def __len__(self) -> int:
         return len(self.key)

@@ -85,7 +85,7 @@ def smooth_environment(width: int = 256) -> np.ndarray:
     return image.astype(np.float32)
 
 
-def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.World:  # noqa: ANN001
+def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.World:
     """Give the scene a world of this equirectangular image, turned by a Mapping node (type Point)."""
     from pathlib import Path
 
