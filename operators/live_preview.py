@@ -253,5 +253,5 @@ def unregister() -> None:
     for timer in (_catch_up, _note_viewport):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    viewport.disable()
+    disable()
     _live.shown.clear()

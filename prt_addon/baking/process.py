@@ -76,7 +76,7 @@ class BakeProcess:
                 )
             except OSError as error:
                 raise PRTError(
-                    "bake process", f"Python could not be started ({error})", "Check the Blender installation"
+                    "Bake process", f"Python could not be started ({error})", "Check the Blender installation"
                 ) from error
 
     def poll(self) -> list[Message]:
@@ -137,7 +137,7 @@ class BakeProcess:
         """The message for a child that ended without saying why."""
         code = self.returncode
         if self._cancelled:
-            return error_message(Cancelled("bake", "cancelled", "Bake again to resume where it stopped"))
+            return error_message(Cancelled("Bake", "cancelled", "Bake again to resume where it stopped"))
         last = _last_line(self.job / ERROR_FILE)
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
@@ -149,7 +149,7 @@ class BakeProcess:
             remedy = "Choose a lower order, fewer directions or fewer objects and bake again to resume"
         else:
             remedy = "The previous bake is untouched; bake again to resume"
-        return error_message(PRTError("bake", cause, remedy))
+        return error_message(PRTError("Bake", cause, remedy))
 
 
 def error_message(error: PRTError) -> Message:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..compression.coherence import overdraw
 from ..compression.encoding import Encoding
 from ..lighting.reference_light import ReferenceLight
+from ..lighting.windowing import remove_ringing
 from ..reporting.stages import StageTimer
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
@@ -98,6 +99,7 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
               resumed: list[str], seconds: float) -> dict[str, Any]:
     """The report of design/contract.md, with what else a reader may want."""
     left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
+    windowing = _windowing(light, plan.needs.order, left_out)
     stages = timer.stages
     rays = sum(int(stage["rays"]) for stage in stages)
     return {
@@ -124,8 +126,24 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "bounces": None if bounced is None else {
             "method": bounced.method, "count": bounced.bounces, "products": bounced.steps, "history": bounced.history},
         "stability": stability,
+        "windowing": windowing,
         "resumed": list(resumed),
     }
+
+
+def _windowing(light: ReferenceLight | None, order: int, left_out: list[LeftOut]) -> dict[str, Any] | None:
+    """What a window against ringing would do to the scene's present light; None without light.
+
+    A bake holds for any light, so the window is the relighting's choice (off unless asked for); where the present
+    light does not ring it is listed as left out.
+    """
+    if light is None or light.is_black:
+        return None
+    found = remove_ringing(light.coefficients(order))
+    if not found.rings:
+        left_out.append(LeftOut("a window against ringing", "the light stays positive at this order",
+                                "blur of the light's detail"))
+    return {"rings": found.rings, "lowest": found.lowest_before, "cost": found.cost}
 
 
 def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None, encodings: dict[str, Encoding],

@@ -83,7 +83,7 @@ def run(job_folder: Path) -> int:
         emit("error", subject=error.subject, cause=error.cause, remedy=error.remedy, exit_code=error.exit_code)
         return error.exit_code
     except MemoryError:
-        emit("error", subject="bake", cause="memory ran out",
+        emit("error", subject="Bake", cause="memory ran out",
              remedy="Choose a lower order, fewer directions or fewer objects and bake again to resume", exit_code=1)
         return 1
     emit("done")

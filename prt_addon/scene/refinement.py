@@ -3,17 +3,49 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-# A triangle is cut into at most 4^12 parts: beyond that the spacing is wrong, not the mesh.
-MAXIMUM_ROUNDS = 12
+from ..errors import BadScene
+
+# Halvings of an edge: enough for a landscape of a thousand kilometres under a teapot.
+MAXIMUM_ROUNDS = 24
+# Of one object after refining. A mesh that comes with more keeps them.
+MOST_POINTS = 4_000_000
+
+
+@dataclass(frozen=True)
+class EdgeLimit:
+    """How long edges may be: `longest` metres at the objects that are baked, and in proportion to the distance from
+    them beyond their own size (a ground plane to the horizon looks equally fine everywhere as they see it).
+
+    low, high: (3,) corners of the box around the baked objects.
+    """
+
+    longest: float
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    def exceeded(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether edges between points (..., 3) are too long; the same from either end."""
+        length = np.sqrt(np.sum((start - end) ** 2, axis=-1))
+        too_long = length > self.longest
+        middle = 0.5 * (start + end)[too_long]
+        outside = np.maximum(np.maximum(self.low - middle, middle - self.high), 0.0)
+        # No point of the edge is nearer than this.
+        distance = np.sqrt(np.sum(outside ** 2, axis=-1)) - 0.5 * length[too_long]
+        size = max(float(np.sqrt(np.sum((self.high - self.low) ** 2))), np.finfo(np.float64).tiny)
+        too_long[too_long] = length[too_long] > self.longest * np.maximum(1.0, distance / size)
+        return too_long
 
 
 def refine(points: NDArray[np.float64], normals: NDArray[np.float64], albedo: NDArray[np.float64],
-           triangles: NDArray[np.int32], longest_edge: float,
+           triangles: NDArray[np.int32], limit: EdgeLimit, name: str,
            ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
-    """Split edges longer than longest_edge (metres) at their middle until none is left.
+    """Split edges longer than the limit at their middle until none is left. Raises BadScene, naming the object `name`,
+    where that asks for more points than any machine has memory for.
 
     An edge is split for both its triangles or for neither, so no T-junction appears between triangles that share
     points. New points stay on the flat triangle (shadows fall on what is drawn); normals and albedo are interpolated.
@@ -21,11 +53,14 @@ def refine(points: NDArray[np.float64], normals: NDArray[np.float64], albedo: ND
     for _ in range(MAXIMUM_ROUNDS):
         edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).astype(np.int64)
         low, high = edges.min(axis=2), edges.max(axis=2)
-        too_long = np.sqrt(np.sum((points[low] - points[high]) ** 2, axis=2)) > longest_edge
+        too_long = limit.exceeded(points[low], points[high])
         if not too_long.any():
             break
         key = low * len(points) + high
         split_keys, middle_of = np.unique(key[too_long], return_inverse=True)
+        if len(points) + len(split_keys) > MOST_POINTS:
+            raise BadScene(name, f"the spacing asks for more than {MOST_POINTS:,} receivers on it",
+                           "Raise the setting spacing, or set it to 0 to bake at the mesh's own vertices")
         middle = np.full(triangles.shape, -1, np.int64)
         middle[too_long] = len(points) + middle_of
         ends = np.stack([split_keys // len(points), split_keys % len(points)], axis=1)

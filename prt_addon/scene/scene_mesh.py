@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import BadScene
 from .object_mesh import ObjectMesh, bounding_diagonal, clean
 from .orientation import outward
-from .refinement import refine
+from .refinement import EdgeLimit, refine
 
 # Corners of one vertex whose normals differ by less than 0.25 degrees, or albedos by less than half an 8-bit step, are
 # one receiver: below what interpolation shows, above the noise of Blender's packed custom normals.
@@ -67,19 +67,21 @@ class SceneMesh:
     def assemble(objects: list[ObjectMesh], spacing: float = 0.0) -> SceneMesh:
         """Join objects into one scene.
 
-        spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal; 0 keeps the
-        meshes as they are. Raises BadScene, naming the object, where nothing can be baked.
+        spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal, and beyond
+        that diagonal of the distance from them; 0 keeps the meshes as they are. Raises BadScene, naming the object, where nothing can be baked.
         """
         if not any(o.is_target for o in objects):
             raise BadScene("scene", "no mesh object to bake", "Select a mesh object, or make one visible in renders")
         warnings: list[str] = []
         cleaned = [clean(o, warnings) for o in objects]
         cleaned = [outward(o, [c for c in cleaned if c is not o], warnings) for o in cleaned]
-        diagonal = bounding_diagonal([o.positions for o in cleaned if o.is_target])
+        targets = np.concatenate([o.positions for o in cleaned if o.is_target])
+        diagonal = bounding_diagonal([targets])
         if diagonal <= 0.0:
             name = next(o.name for o in cleaned if o.is_target)
             raise BadScene(name, "all vertices lie in one point", "Give the object a size")
-        parts = [_split(o, spacing * diagonal, warnings) for o in cleaned]
+        limit = EdgeLimit(spacing * diagonal, targets.min(axis=0), targets.max(axis=0))
+        parts = [_split(o, limit, warnings) for o in cleaned]
         return _join(cleaned, parts, tuple(warnings))
 
 
@@ -127,8 +129,8 @@ def _corner_groups(mesh: ObjectMesh) -> tuple[NDArray[np.int64], int]:
     return group, count
 
 
-def _split(mesh: ObjectMesh, longest_edge: float, warnings: list[str]) -> _Part:
-    """Corner groups become points; triangles with an edge over longest_edge (metres; 0 = none) are refined."""
+def _split(mesh: ObjectMesh, limit: EdgeLimit, warnings: list[str]) -> _Part:
+    """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined."""
     group, count = _corner_groups(mesh)
     points = np.empty((count, 3))
     points[:len(mesh.positions)] = mesh.positions
@@ -141,9 +143,9 @@ def _split(mesh: ObjectMesh, longest_edge: float, warnings: list[str]) -> _Part:
     _replace_normals(points, triangles, normals, degenerate)
     albedo = np.clip(_mean_per_group(mesh.corner_albedo.reshape(-1, 3), group, count), 0.0, 1.0)
     matches = count == len(mesh.positions)
-    if longest_edge > 0.0:
+    if limit.longest > 0.0:
         before = len(points)
-        points, normals, albedo, triangles = refine(points, normals, albedo, triangles, longest_edge)
+        points, normals, albedo, triangles = refine(points, normals, albedo, triangles, limit, mesh.name)
         if len(points) != before:
             matches = False
             warnings.append(f"{mesh.name}: refined from {before} to {len(points)} receivers")

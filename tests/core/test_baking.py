@@ -165,3 +165,17 @@ def test_reference_light_keeps_all_light_of_a_one_pixel_sun():
     assert light.image.shape == (64, 128, 3)
     assert np.allclose(light.coefficients(1), project(image, 1), rtol=1e-6)
     assert averaged(np.ones((100, 250, 3), np.float32), 128) == pytest.approx(1.0)
+
+
+def test_window_is_left_out_where_nothing_rings_and_priced_where_it_does():
+    gradient = np.linspace(2.0, 1.0, 32, dtype=np.float32)[:, None, None] * np.ones((1, 64, 3), np.float32)
+    calm = exhaust(bake(still_life(), replace(SMALL, error_receivers=0),
+                        light=ReferenceLight.of(gradient, None, [], "a gradient"))).report
+    assert calm["windowing"]["rings"] is False and calm["windowing"]["cost"] == 0.0
+    assert any("ringing" in item["what"] for item in calm["left_out"])
+    image = np.zeros((32, 64, 3), np.float32)
+    image[4, 20] = 100.0
+    sharp = exhaust(bake(still_life(), replace(SMALL, error_receivers=0),
+                         light=ReferenceLight.of(image, None, [], "one pixel"))).report
+    assert sharp["windowing"]["rings"] is True and 0.0 < sharp["windowing"]["cost"] < 1.0
+    assert not any("ringing" in item["what"] for item in sharp["left_out"])
