@@ -28,7 +28,6 @@ from ..prt_addon.blender.stored import write_baked
 from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import BadScene, StorageError
 from ..prt_addon.scene.scene_mesh import SceneMesh
-from ..prt_addon.storage.container import BakedTransfer
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 KEPT_DAYS = 14
@@ -130,17 +129,12 @@ class BakeSession:
             raise BadScene(self.scene_name, "the scene was removed or renamed while its bake ran", "Undo that")
         names = list(result.objects)
         for scene_object, name in zip(find_objects(names, scene), names, strict=True):
-            write_baked(scene_object, _with_source(result.objects[name]), self.digests[name], self.surroundings)
+            write_baked(scene_object, result.objects[name], self.digests[name], self.surroundings)
         return result
 
     def discard(self) -> None:
         """Drop the job folder."""
         jobs.discard(self.job)
-
-
-def _with_source(baked: BakedTransfer) -> BakedTransfer:
-    """The bake with what storing asks: whether its points are the vertices of the evaluated mesh."""
-    return replace(baked, header={**baked.header, "source": {"on_source_mesh": baked.header["matches_source"]}})
 
 
 def _check_storable(targets: list[bpy.types.Object]) -> None:

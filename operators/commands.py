@@ -48,6 +48,10 @@ def main(arguments: list[str], output: TextIO | None = None) -> int:
     except PRTError as error:
         print(f"{COMMAND}: {_one_line(str(error))}", file=sys.stderr, flush=True)
         return error.exit_code
+    except OSError as error:  # what no check foresaw: a name too long, a closed pipe, a folder that went away
+        print(f"{COMMAND}: {_one_line(f'{error.filename or COMMAND}: {error.strerror or error}')}. "
+              "Check that it can be read and written", file=sys.stderr, flush=True)
+        return PRTError.exit_code
     except KeyboardInterrupt:
         print(f"{COMMAND}: interrupted. Run the same command again to resume", file=sys.stderr, flush=True)
         return Cancelled.exit_code
@@ -60,7 +64,7 @@ def run_as_program(arguments: list[str]) -> int:
     Blender's C code writes to file descriptor 1 past Python's sys.stdout, at its exit too ("Blender quit").
     """
     sys.stdout.flush()
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as results:
+    with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="surrogateescape") as results:
         os.dup2(2, 1)
         return main(arguments, results)
 
@@ -116,6 +120,8 @@ def _add_light_options(parser: argparse.ArgumentParser) -> None:
                         help="an equirectangular picture in place of the World")
     parser.add_argument("--rotate", type=float, default=0.0, metavar="DEG",
                         help="turns the environment, as a Z rotation in the World's Mapping node does")
+    parser.add_argument("--window", action="store_true",
+                        help="take ringing out of the light, where it rings, at the price of some of its detail")
 
 
 def _add_analyze(group: argparse._SubParsersAction) -> None:

@@ -29,6 +29,7 @@ from .properties import assign, session
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
 NOTE_WAIT = 1.0  # after a redraw was asked for, its outcome is known
+SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
 
@@ -67,11 +68,17 @@ def bakes_changed() -> None:
     _schedule(SHORTEST_WAIT)
 
 
+def light_changed() -> None:
+    """A setting of the light was changed: evaluate it again soon."""
+    _live.light_dirty = True
+    _schedule(SHORTEST_WAIT)
+
+
 def enable() -> None:
     """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
     _read_bakes()
     _read_light()
-    viewport.enable(draw_list)
+    viewport.enable(draw_list, shows_everything)
     assign(session(), preview=True, preview_message="")
 
 
@@ -96,6 +103,15 @@ def draw_list() -> list[DrawItem]:
     return items
 
 
+def shows_everything() -> bool:
+    """Whether every surface that this region shows is drawn by us: then Blender's depth is not needed (its floor grid
+    and jittered samples are in it)."""
+    space = bpy.context.space_data
+    return all(found.name in _live.shown or found.type not in SURFACE_TYPES or not found.visible_in_viewport_get(space)
+               or found.display_type in ("BOUNDS", "WIRE")
+               for found in bpy.context.view_layer.objects)
+
+
 def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64]:
     """The light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
     scale = np.sqrt((moved[:3, :3] ** 2).sum(axis=0))
@@ -104,7 +120,7 @@ def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64]:
         return _live.light  # not turned, or sheared: then the bake is stale anyway
     key = turn.round(6).tobytes()
     if key not in _live.rotated:
-        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: rotate(_live.light.T, turn.T).T}
+        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: rotate(_live.light, turn.T)}
     return _live.rotated[key]
 
 
@@ -153,7 +169,8 @@ def _read_light() -> None:
         _live.light = None
         return
     started = time.perf_counter()
-    light = light_coefficients(bpy.context.scene, bpy.context.evaluated_depsgraph_get(), order)
+    light = light_coefficients(bpy.context.scene, bpy.context.evaluated_depsgraph_get(), order,
+                               window=bpy.context.scene.prt.window)
     _live.light_seconds = time.perf_counter() - started
     assign(session(), preview_message="\n".join(light.warnings))
     if (order, light.signature) != _live.signature:

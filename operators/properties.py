@@ -34,6 +34,13 @@ def _redraw(_settings: PRTSettings, _context: bpy.types.Context) -> None:
     redraw("WINDOW")
 
 
+def _light_changed(_settings: PRTSettings, _context: bpy.types.Context) -> None:
+    """The preview's light depends on this setting."""
+    from .live_preview import light_changed  # it needs this module to be loaded
+
+    light_changed()
+
+
 class PRTSettings(bpy.types.PropertyGroup):
     """Settings of the bake and of the preview: Scene.prt."""
 
@@ -54,6 +61,12 @@ class PRTSettings(bpy.types.PropertyGroup):
     exposure: FloatProperty(
         name="Exposure", update=_redraw, default=0.0, soft_min=-5.0, soft_max=5.0, step=10, precision=2,
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
+    )
+
+    window: BoolProperty(
+        name="Soften Ringing", update=_light_changed, default=False,
+        description="Takes dark ripples around very bright, small lights away. Costs some of the light's detail, and "
+                    "nothing where nothing rings",
     )
 
     def overrides(self) -> dict[str, str]:

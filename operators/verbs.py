@@ -21,7 +21,7 @@ from ..prt_addon.baking.process import raise_error
 from ..prt_addon.baking.settings import BakeSettings, make_settings
 from ..prt_addon.basis.spherical_harmonics import order_of
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import Light, light_coefficients
+from ..prt_addon.blender.lights import Light, environment_picture, light_coefficients
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import BadArguments, BadScene, StorageError
@@ -94,7 +94,13 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
                                        max(1, round(scene.render.resolution_y * percentage)))
     placed = [(b, np.eye(4)) for b in baked.values()]  # small: a bake that was moved is stale and refused
-    picture = offscreen.draw_camera(scene, placed, light.coefficients, width, height)
+    background = None
+    if not scene.render.film_transparent:
+        sky, rotation = environment_picture(scene, bpy.context.evaluated_depsgraph_get(), arguments.environment,
+                                            arguments.rotate)
+        sample = offscreen.environment_sampler(sky, rotation)
+        background = offscreen.camera_background(scene, sample, width, height)
+    picture = offscreen.draw_camera(scene, placed, light.coefficients, width, height, background)
     offscreen.write_png(arguments.output, picture, scene)
     yield str(arguments.output)
 
@@ -160,6 +166,8 @@ def _open(path: Path) -> bpy.types.Scene:
     except RuntimeError as error:
         cause = " ".join(str(error).removeprefix("Error:").split()).rstrip(".")
         raise StorageError(str(path), f"Blender can't open it ({cause})", "Give an intact .blend file") from error
+    if bpy.context.mode != "OBJECT":  # a file saved in edit mode opens in it, and then its mesh can't be read
+        bpy.ops.object.mode_set(mode="OBJECT")
     return bpy.context.scene
 
 
@@ -224,7 +232,7 @@ def _light(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: a
         raise BadArguments("--rotate", f"{arguments.rotate} is no angle", "Give degrees")
     order = max(order_of(b.columns) for b in baked.values())
     light = light_coefficients(scene, bpy.context.evaluated_depsgraph_get(), order, arguments.environment,
-                               arguments.rotate, use_scene_lights)
+                               arguments.rotate, use_scene_lights, arguments.window)
     for warning in light.warnings:
         print(f"prt: warning: {warning}", file=sys.stderr, flush=True)
     return light

@@ -65,6 +65,7 @@ class PRT_PT_preview(_Sidebar, bpy.types.Panel):
         column = layout.column()
         column.active = session.preview
         column.prop(context.scene.prt, "exposure")
+        column.prop(context.scene.prt, "window")
         for line in (*session.preview_message.splitlines(), *session.viewport_message.splitlines()):
             _wrapped(layout, context, line, "INFO")
 

@@ -25,7 +25,7 @@ def load_extension() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command; stdout carries its result alone. Blender's log goes to stderr from the import on."""
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as results:
+    with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="surrogateescape") as results:
         os.dup2(2, 1)
         load_extension()
         return importlib.import_module(f"{PACKAGE}.operators.commands").main(arguments, results)

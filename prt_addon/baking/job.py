@@ -20,7 +20,7 @@ from ..lighting.reference_light import ReferenceLight
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer, check_header
 from ..storage.digests import digest_arrays, digest_json
-from ..storage.files import load_arrays, save_arrays
+from ..storage.files import intact, load_arrays, save_arrays
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
@@ -56,7 +56,7 @@ def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: Refer
     except OSError as error:
         raise StorageError(str(folder), f"the job folder can't be made ({error.strerror})",
                            "Choose a folder that can be written") from error
-    if not (folder / SCENE_FILE).exists():
+    if intact(folder / SCENE_FILE) is None:
         save_arrays(folder / SCENE_FILE, arrays, header)
     return folder
 
@@ -87,7 +87,7 @@ def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | No
 
 def run_job(folder: Path) -> Generator[Progress]:
     """Bake a job, resuming after its finished stages, and leave the result in its folder."""
-    if (folder / RESULT_FILE).exists():
+    if intact(folder / RESULT_FILE) is not None:
         return
     scene, settings, light, digests = read_job(folder)
     result = yield from bake(scene, settings, folder, light, digests)

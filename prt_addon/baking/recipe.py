@@ -27,7 +27,7 @@ from ..lighting.reference_light import ReferenceLight, stand_in_light
 from ..reporting.stages import StageTimer
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
-from ..storage.files import load_arrays, save_arrays
+from ..storage.files import intact, save_arrays
 from ..tracing.tracer import Tracer
 from ..transport.buried import buried_receivers, fill_buried
 from ..transport.direct import direct_transfer
@@ -137,8 +137,10 @@ class _Bake:
         path = self.folder / f"{stage}.npz" if self.folder else None
         if path is None or not path.exists():
             return None
-        self.resumed.append(stage)
-        return load_arrays(path)
+        found = intact(path)
+        if found is not None:
+            self.resumed.append(stage)
+        return found
 
     def _save(self, stage: str, arrays: dict[str, NDArray], header: dict[str, Any] | None = None) -> None:
         if self.folder:

@@ -75,6 +75,16 @@ def light_coefficients(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, o
     return Light(coefficients, parts, warnings, digest_arrays(coefficients))
 
 
+def environment_picture(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph,
+                        environment_override: str | PathLike[str] | None = None, rotate_degrees: float = 0.0,
+                        ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """What stands behind the scene: the environment averaged to a small equirectangular picture (h, w, 3), and its
+    rotation (3, 3). Arguments and errors as for `light_coefficients`."""
+    environment = _environment(scene, depsgraph, environment_override)
+    picture = environment.projected.small * environment.scale.astype(np.float32)
+    return picture, world_rotation(rotate_degrees) @ environment.rotation  # small
+
+
 def reference_light(depsgraph: bpy.types.Depsgraph) -> ReferenceLight | None:
     """The scene's whole light for the error budget; None where there is none. Raises PRTError as above."""
     environment = read_environment(depsgraph.scene, depsgraph)

@@ -56,7 +56,8 @@ def clean(mesh: ObjectMesh, warnings: list[str]) -> ObjectMesh:
                        "Delete them, or mend the modifier or the scale that puts them there")
     uncoloured = int((~np.isfinite(mesh.corner_albedo).all(axis=(1, 2))).sum())
     if uncoloured:
-        raise BadScene(mesh.name, f"the colour of {uncoloured} triangles is not a number", "Mend its materials' colours")
+        raise BadScene(mesh.name, f"the colour of {uncoloured} triangles is not a number",
+                       "Mend the colours of its materials")
     if not len(mesh.triangles):
         if mesh.is_target:
             raise BadScene(mesh.name, "the mesh has no faces", "Add faces, or bake another object")

@@ -57,6 +57,15 @@ def load_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     return arrays, header
 
 
+def intact(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
+    """`load_arrays` of a file that can be made again: None, and the file removed, where it is broken."""
+    try:
+        return load_arrays(path)
+    except StorageError:
+        path.unlink(missing_ok=True)
+        return None
+
+
 def save_json(path: Path, value: Any) -> None:
     """Write a JSON-able value, atomically."""
     write_atomically(path, lambda stream: stream.write(json.dumps(value, indent=1).encode()) and None)
