@@ -34,10 +34,13 @@ KEPT_DAYS = 14
 
 
 def jobs_folder() -> Path:
-    """Where job folders lie: the extension's own user folder, or Blender's for a checkout without installation."""
+    """Where job folders lie: the extension's own user folder, or Blender's for a checkout without installation.
+
+    `write_job` makes it: Blender's `create` prints a traceback where it can't, and returns an empty path.
+    """
     if ROOT_PACKAGE.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(ROOT_PACKAGE, path="jobs", create=True))
-    return Path(bpy.utils.user_resource("DATAFILES", path="prt/jobs", create=True))
+        return Path(bpy.utils.extension_path_user(ROOT_PACKAGE, path="jobs"))
+    return Path(bpy.utils.user_resource("DATAFILES", path="prt/jobs"))
 
 
 def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> SceneMesh:

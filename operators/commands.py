@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -64,7 +65,9 @@ def run_as_program(arguments: list[str]) -> int:
     Blender's C code writes to file descriptor 1 past Python's sys.stdout, at its exit too ("Blender quit").
     """
     sys.stdout.flush()
-    with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="surrogateescape") as results:
+    # Unbuffered: what a closed pipe or a full disk refused must not come up again when the stream is closed.
+    with io.TextIOWrapper(os.fdopen(os.dup(1), "wb", buffering=0), "utf-8", "surrogateescape",
+                          write_through=True) as results:
         os.dup2(2, 1)
         return main(arguments, results)
 

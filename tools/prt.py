@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import io
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -23,10 +25,20 @@ def load_extension() -> None:
     spec.loader.exec_module(module)
 
 
+def leave(_number: int, _frame: object) -> None:
+    """End at once. A KeyboardInterrupt while Blender starts is swallowed by it, and half its add-ons are missing."""
+    os.write(2, b"prt: interrupted. Run the same command again\n")
+    os._exit(3)
+
+
 def run(arguments: list[str]) -> int:
     """Run one command; stdout carries its result alone. Blender's log goes to stderr from the import on."""
-    with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="surrogateescape") as results:
+    # Unbuffered: what a closed pipe or a full disk refused must not come up again when the stream is closed.
+    with io.TextIOWrapper(os.fdopen(os.dup(1), "wb", buffering=0), "utf-8", "surrogateescape",
+                          write_through=True) as results:
         os.dup2(2, 1)
+        for number in (signal.SIGINT, signal.SIGTERM):  # until the command takes them over
+            signal.signal(number, leave)
         load_extension()
         return importlib.import_module(f"{PACKAGE}.operators.commands").main(arguments, results)
 
