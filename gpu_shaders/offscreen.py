@@ -96,8 +96,6 @@ def draw_items(
     Raises BadArguments for a size that does not fit, BadScene for a camera or a light that does not, PRTError without
     a graphics driver.
     """
-    if not (0 < width <= LARGEST_TEXTURE and 0 < height <= LARGEST_TEXTURE):
-        raise BadArguments("the preview", f"{width}x{height} pixels", f"Choose 1 to {LARGEST_TEXTURE} pixels per side")
     view_projection = camera_view_projection(scene, width, height)
     prepare_gpu()
     samples = max(1, min(samples, LARGEST_TEXTURE // max(width, height)))
@@ -135,7 +133,12 @@ def _over(picture: NDArray[np.float32], background: ArrayLike) -> NDArray[np.flo
 
 
 def camera_view_projection(scene: bpy.types.Scene, width: int, height: int) -> NDArray[np.float64]:
-    """(4, 4) from world to clip space of the scene's active camera. Raises BadScene without a usable camera."""
+    """(4, 4) from world to clip space of the scene's active camera.
+
+    Raises BadScene without a usable camera, BadArguments for a size that no picture can have.
+    """
+    if not (0 < width <= LARGEST_TEXTURE and 0 < height <= LARGEST_TEXTURE):
+        raise BadArguments("the preview", f"{width}x{height} pixels", f"Choose 1 to {LARGEST_TEXTURE} pixels per side")
     camera = scene.camera
     if camera is None:
         raise BadScene(f"scene {scene.name}", "it has no active camera", "Add one, or make one active (Ctrl Numpad 0)")
@@ -151,8 +154,10 @@ def camera_view_projection(scene: bpy.types.Scene, width: int, height: int) -> N
         scale_y=scene.render.pixel_aspect_y,
     )
     # Blender's cameras ignore their object's scale.
-    view = camera.evaluated_get(depsgraph).matrix_world.normalized().inverted()
-    return np.array(projection, np.float64) @ np.array(view, np.float64)  # small
+    placed = np.array(camera.evaluated_get(depsgraph).matrix_world.normalized(), np.float64)
+    if not (np.isfinite(placed).all() and np.isfinite(projection).all()) or not np.linalg.det(placed):  # small
+        raise BadScene(camera.name, "its place or scale makes no view", "Give it finite coordinates and a scale of one")
+    return np.array(projection, np.float64) @ np.linalg.inv(placed)  # small
 
 
 def camera_background(
