@@ -10,8 +10,11 @@ under a stand-in sky. Seconds are without the budget's own time.
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import replace
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the bake's process; before numpy loads
 
 from common import ROOT, load_obj, mesh_path, print_table, smooth_object
 

@@ -10,8 +10,11 @@ bounce takes at most 1.5 x its tracing.
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the bake's process; before numpy loads
 
 import numpy as np
 from common import best_of, drain, load_obj, mesh_path, print_table, smooth_object

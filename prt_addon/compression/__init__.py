@@ -2,6 +2,6 @@
 """Clustered principal component analysis of a surface signal (Sloan et al. 2003, sections 4 and 5).
 
 Rule: knows nothing of surfaces, light or colours; a signal is points x values. `encoding.encode` is the one entrance.
-Reading order: settings, global_frame, subspaces, pca, vector_quantization, seeding, reclassify, clustered_pca,
-adaptive, encoding, coherence.
+Reading order: settings, monitor, global_frame, subspaces, pca, vector_quantization, seeding, reclassify, neighbours,
+rebalancing, clustered_pca, adaptive, encoding, coherence.
 """

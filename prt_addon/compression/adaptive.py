@@ -6,14 +6,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .clustered_pca import Report
 from .global_frame import GlobalFrame
+from .monitor import Monitor
 from .reclassify import reclassify
 from .settings import EncoderSettings
 from .subspaces import SPARE, Subspaces, update
 
 # Rounds of redistributing vectors and reclassifying.
 ROUNDS = 10
+# Updates after vectors are added, so that power steps find the spectra that decide about them.
+SPECTRUM_STEPS = 2
 
 
 def distribute(gains: NDArray[np.float64], counts: NDArray[np.int64], budget: int) -> NDArray[np.int64]:
@@ -60,26 +62,30 @@ def adaptation_pays(errors: NDArray[np.float64], counts: NDArray[np.int64], gain
     return bool(then - now > 0.02 * errors.sum())
 
 
-def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, report: Report) -> float:
-    """Section 4.3: classify with each cluster's own number of vectors, update, redistribute; returns the error.
+def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monitor: Monitor) -> bool:
+    """Section 4.3, in place: classify with each cluster's own number of vectors, update, redistribute.
 
-    Keeps the state that it was given where redistribution does not lower the error.
+    Returns False, with nothing changed, where the clusters' spectra say that it would not pay. Keeps the best state.
     """
     most = settings.most_vectors
     budget = len(state.labels) * settings.vectors
     data = frame.coordinates
     state.resize(data.shape[1], most + SPARE)
-    best = update(data, state), state.labels, state.vectors
+    for _ in range(SPECTRUM_STEPS):
+        best = update(data, state, monitor.tick), state.labels, state.vectors
+    if not adaptation_pays(state.errors, state.counts, state.spread[:, :most], settings.vectors):
+        monitor.note("adaptive left out", best[0], 1.0)
+        return False
     for round_number in range(ROUNDS):
         state.vectors = distribute(state.spread[:, :most], state.counts, budget)
         error = state.error
-        report("adaptive", error, (round_number + 1) / ROUNDS)
+        monitor.note("adaptive", error, (round_number + 1) / ROUNDS)
         last = best[0]
         if error < last:
             best = error, state.labels, state.vectors
         if error > last * (1 - settings.tolerance) or round_number == ROUNDS - 1:
             break
-        reclassify(data, state)
-        update(data, state)
+        reclassify(data, state, monitor.tick)
+        update(data, state, monitor.tick)
     state.labels, state.vectors = best[1], best[2]
-    return best[0]
+    return True

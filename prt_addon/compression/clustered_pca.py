@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Static and iterative clustered PCA (Sloan et al. 2003, sections 4.1 and 4.2) in a rotated signal."""
+"""Static and iterative clustered PCA (Sloan et al. 2003, sections 4.1 and 4.2) in a rotated signal.
+
+Vectors are added one by one with a few quick sweeps in between, among neighbours and on the leading values only; when
+all are there, clusters are rearranged, and exact sweeps on all values end it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .global_frame import GlobalFrame
+from .monitor import Monitor
+from .neighbours import Neighbours, Sweep, reclassify_near
+from .rebalancing import exchange, rebalance
 from .reclassify import reclassify
 from .seeding import split_seeds
 from .settings import EncoderSettings
@@ -17,89 +24,170 @@ from .vector_quantization import lbg, random_means
 
 # Energy that the values left out may hold, relative to the current squared error.
 TRUNCATION = 0.1
+# The same while splitting, whose clusters are only a start.
+SEED_TRUNCATION = 0.3
 # Vectors with which the first splits are judged.
 SEED_VECTORS = 2
-# Power steps for the first vectors of clusters that had none.
-FIRST_STEPS = 3
-# (stage, squared error in the frame's units, fraction done)
-Report = Callable[[str, float, float], None]
+# Relative decrease of the squared error below which sweeps end while vectors are still to be added, and before the
+# exact ones, in multiples of the tolerance asked for: what these sweeps leave, later ones find.
+WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
+# Most rounds of rearranging clusters.
+ROUNDS = 2
 
 
-def static_labels(frame: GlobalFrame, settings: EncoderSettings) -> NDArray[np.int32]:
+@dataclass
+class Work:
+    """What the steps of one iterative encode share."""
+
+    frame: GlobalFrame
+    settings: EncoderSettings
+    monitor: Monitor
+    neighbours: Neighbours
+
+    @staticmethod
+    def of(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monitor: Monitor) -> Work:
+        """For an encode that starts from a state."""
+        return Work(frame, settings, monitor, Neighbours(len(state.means)))
+
+    def fit(self, state: Subspaces, width: int) -> float:
+        """Update a state on `width` leading values; the error returned counts the energy left out as error, so it
+        bounds the true one from above."""
+        state.resize(width, state.bases.shape[1])
+        return update(self.frame.coordinates[:, :width], state, self.monitor.tick) + float(self.frame.tail[width])
+
+    def sweep(self, state: Subspaces, error: float) -> tuple[Sweep, float]:
+        """One classification among neighbours and one update, on as many values as the error asks for."""
+        width = state.means.shape[1]
+        data, before = self.frame.coordinates[:, :width], state.labels
+        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.tick)
+        self.neighbours.learn(before, state.labels, sweep.runner_up)
+        return sweep, self.fit(state, max(width, self.frame.leading(TRUNCATION * error)))
+
+
+def static_labels(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -> NDArray[np.int32]:
     """Section 4.1: LBG from random points of the signal."""
     generator = np.random.default_rng(settings.seed)
     data = frame.coordinates
-    return lbg(data, random_means(data, settings.clusters, generator), settings.iterations)
+    return lbg(data, random_means(data, settings.clusters, generator), settings.iterations, monitor.tick)
 
 
-def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float,
+def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, monitor: Monitor,
                 seed_vectors: int = SEED_VECTORS) -> Subspaces:
     """Subspaces from best-first splits.
 
     With a target, splits are judged with all vectors and end where the target is met, so that a simple signal gets few
     clusters; otherwise with seed_vectors.
     """
-    vectors = settings.vectors if settings.target_error is not None else min(seed_vectors, settings.vectors)
     if settings.target_error is not None:
-        width = frame.leading(TRUNCATION * enough)
-        labels = split_seeds(frame.coordinates, settings.clusters, vectors, enough - frame.tail[width], lambda _: width)
+        vectors, width = settings.vectors, frame.leading(TRUNCATION * enough)
+        labels, _ = split_seeds(frame.coordinates, settings.clusters, vectors, enough - frame.tail[width],
+                                lambda _: width, monitor.tick)
     else:
-        labels = split_seeds(frame.coordinates, settings.clusters, vectors, enough,
-                             lambda error: frame.leading(TRUNCATION * error))
-    state = from_labels(labels, int(labels.max()) + 1, 1, vectors)
-    return state
+        vectors = min(seed_vectors, settings.vectors)
+        labels, error = split_seeds(frame.coordinates, settings.clusters, vectors, enough,
+                                    lambda error: frame.leading(SEED_TRUNCATION * error), monitor.tick)
+        width = frame.leading(TRUNCATION * error)
+    return from_labels(labels, int(labels.max()) + 1, width, vectors)
 
 
-def random_start(frame: GlobalFrame, settings: EncoderSettings, number: int) -> Subspaces:
+def random_start(frame: GlobalFrame, settings: EncoderSettings, number: int, monitor: Monitor) -> Subspaces:
     """The paper's own start: random points of the signal, LBG, no vectors yet."""
     generator = np.random.default_rng((settings.seed, number))
-    labels = lbg(frame.coordinates, random_means(frame.coordinates, settings.clusters, generator), settings.iterations)
+    means = random_means(frame.coordinates, settings.clusters, generator)
+    labels = lbg(frame.coordinates, means, settings.iterations, monitor.tick)
     return from_labels(labels, settings.clusters, frame.coordinates.shape[1], 0)
 
 
-def converge(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, tolerance: float,
-             values: int | None = None) -> float:
-    """Alternate update and classification until the error falls by less than `tolerance` a sweep; returns the error.
-
-    values: how many leading values to work on; None takes what the current error asks for. The error returned counts
-    the energy left out as error, so it bounds the true one from above.
-    """
-    last, error = np.inf, state.error + frame.tail[state.means.shape[1]]
-    for _ in range(settings.iterations):
-        width = values or max(state.means.shape[1], frame.leading(TRUNCATION * error))
-        grown = width > state.means.shape[1]
-        if grown:
-            state.resize(width, state.bases.shape[1])
-        error = update(frame.coordinates[:, :width], state) + frame.tail[width]
-        if error >= last * (1 - tolerance) and not grown:
+def settle(work: Work, state: Subspaces, error: float, tolerance: float) -> tuple[float, Sweep]:
+    """Alternate classification and update until the error falls by less than `tolerance` a sweep; returns the error
+    and the last classification. error: that of the state given, which is fitted."""
+    last = error
+    for _ in range(work.settings.iterations):
+        width = state.means.shape[1]
+        sweep, error = work.sweep(state, last)
+        if sweep.changed == 0 or (error >= last * (1 - tolerance) and state.means.shape[1] == width):
             break
         last = error
-        if reclassify(frame.coordinates[:, :width], state) == 0:
+    return error, sweep
+
+
+def rearrange(work: Work, state: Subspaces, error: float, sweep: Sweep, tolerance: float) -> float:
+    """Move clusters to where they help more and settle, a bounded number of times, keeping only what lowers the error;
+    returns the error. sweep: the last classification."""
+    for _ in range(ROUNDS):
+        before = state.copy()
+        data = work.frame.coordinates[:, :state.means.shape[1]]
+        if rebalance(data, state, sweep, work.monitor.tick) == 0:
             break
+        now, sweep = settle(work, state, work.fit(state, state.means.shape[1]), tolerance)
+        if now >= error:
+            state.assign(before)
+            break
+        error = now
     return error
 
 
-def add_vector(state: Subspaces) -> None:
-    """One more vector for every cluster; the spare ones move up."""
-    state.vectors += 1
-    state.resize(state.means.shape[1], int(state.vectors.max()) + SPARE)
-
-
-def iterate(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, enough: float, report: Report) -> float:
-    """Section 4.2: vectors added one by one, LBG sweeps in between; at last a sweep on all values."""
-    first = int(state.vectors.max(initial=0))
-    error = np.inf
-    for vectors in range(first, settings.vectors + 1):
-        if vectors > first:
-            fresh = state.bases.shape[1] == 0
-            add_vector(state)
-            if fresh:  # nothing to start from: one power step would classify by an arbitrary direction
-                for _ in range(FIRST_STEPS):
-                    update(frame.coordinates[:, :state.means.shape[1]], state)
-        error = converge(frame, state, settings, settings.tolerance)
-        report(f"{vectors} vectors", error, (vectors + 1 - first) / (settings.vectors + 2 - first))
+def iterate(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, enough: float, monitor: Monitor) -> float:
+    """Section 4.2 from a start, in place: vectors added one by one, then exact sweeps on all values; the error."""
+    work = Work.of(frame, state, settings, monitor)
+    first, last = int(state.vectors.max(initial=0)), settings.vectors
+    error = work.fit(state, state.means.shape[1])
+    for vectors in range(first, last + 1):
+        if vectors > first:  # the first spare vector, fitted with the others
+            state.vectors[:] = vectors
+            state.resize(state.means.shape[1], vectors + SPARE)
+            error = state.error + float(frame.tail[state.means.shape[1]])
+        tolerance = settings.tolerance * (BEFORE_EXACT if vectors == last else WHILE_ADDING)
+        error, sweep = settle(work, state, error, tolerance)
+        if vectors == last and error > enough:
+            error = rearrange(work, state, error, sweep, tolerance)
+        monitor.note(f"{vectors} vectors", error, (vectors + 1 - first) / (last + 3 - first))
         if error <= enough:
             break
-    error = converge(frame, state, settings, settings.tolerance, frame.coordinates.shape[1])
-    report("all values", error, 1.0)
+    error = polish(work, state, enough)
+    monitor.note("all values", error, 1.0)
     return error
+
+
+def polish(work: Work, state: Subspaces, enough: float) -> float:
+    """Exact sweeps on all values until the error falls by less than the tolerance; returns it.
+
+    Clusters that lost all points restart in the worst approximated ones.
+    """
+    data, tick = work.frame.coordinates, work.monitor.tick
+    last = work.fit(state, data.shape[1])
+    for _ in range(work.settings.iterations):
+        changed = reclassify(data, state, tick)
+        error = update(data, state, tick)
+        if error > enough and (state.counts == 0).any() and rebalance(data, state, None, tick):
+            error = update(data, state, tick)
+        if changed == 0 or error >= last * (1 - work.settings.tolerance):
+            break
+        last = error
+    return error
+
+
+def disturb(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, enough: float, monitor: Monitor,
+            trials: int) -> float:
+    """Leave a local minimum by exchanging a cluster of small use for half of one of large error, both drawn at random,
+    and settling anew, `trials` times; only what lowers the error stays. Returns the error.
+
+    For small signals, where the minimum depends most on chance and a trial costs little.
+    """
+    work = Work.of(frame, state, settings, monitor)
+    generator = np.random.default_rng((settings.seed, trials))
+    best = polish(work, state, enough)
+    for trial in range(trials):
+        if best <= enough:
+            break
+        moved = state.copy()
+        sweep, _ = work.sweep(moved, best)
+        if not exchange(frame.coordinates, moved, sweep, generator):
+            break
+        settle(work, moved, work.fit(moved, moved.means.shape[1]), settings.tolerance)
+        error = polish(work, moved, enough)
+        if error < best:
+            best = error
+            state.assign(moved)
+        monitor.note(f"trial {trial}", best, (trial + 1) / trials)
+    return best

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,8 +12,9 @@ from numpy.typing import NDArray
 
 from ..linear_algebra import multiply
 from .adaptive import adapt, trim_vectors
-from .clustered_pca import SEED_VECTORS, iterate, random_start, split_start, static_labels
+from .clustered_pca import SEED_VECTORS, disturb, iterate, random_start, split_start, static_labels
 from .global_frame import GlobalFrame, global_frame
+from .monitor import Monitor, Progress, Tick
 from .pca import principal_components
 from .settings import EncoderSettings
 from .subspaces import Subspaces
@@ -22,10 +22,10 @@ from .subspaces import Subspaces
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
 ROUNDING = 1e-12
 # Random starts beside the splits share a budget of so many values times clusters; no signal gets more than this many.
-START_BUDGET, MOST_STARTS = 1 << 22, 12
+START_BUDGET, MOST_STARTS = 1 << 22, 6
+# Random exchanges of clusters after the starts, for each of the random ones.
+TRIALS_PER_START = 4
 CHUNK = 4096
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class Encoding:
     relative_error: the same over the signal's own sum of squares in the metric.
     discarded: (clusters,) float64, each cluster's share of squared_error, the sum of its discarded D_i^2.
     history: (seconds, stage, squared error).
+    adaptive_left_out: the adaptive method was asked for, but the clusters are so even that different numbers of vectors
+        would not have lowered the error by more than 2 %.
     """
 
     cluster: NDArray[np.int32]
@@ -48,6 +50,7 @@ class Encoding:
     relative_error: float
     discarded: NDArray[np.float64]
     history: tuple[tuple[float, str, float], ...]
+    adaptive_left_out: bool = False
 
     @property
     def storage_cost(self) -> int:
@@ -76,21 +79,15 @@ def encode(signal: NDArray[np.floating], settings: EncoderSettings, metric: NDAr
     Raises PRTError for an empty signal, NaN or infinity, or an impossible metric. Clusters without points are left out,
     and fewer clusters and vectors are used where more would not lower the error.
     """
-    started = time.perf_counter()
-    history: list[tuple[float, str, float]] = []
-    frame = global_frame(signal, metric)
-    unit = frame.scale**2
-
-    def report(stage: str, error: float, fraction: float) -> None:
-        history.append((time.perf_counter() - started, stage, error * unit))
-        if progress is not None:
-            progress(min(max(fraction, 0.0), 1.0))
-
-    labels, vectors = _classify(frame, settings, report)
-    result = _finish(frame, labels, vectors, _enough(frame, settings) if settings.target_error is not None else None)
-    report("done", float(result.discarded.sum()) / unit, 1.0)
-    return Encoding(result.cluster, result.bases, result.weights, result.vectors_per_cluster, result.squared_error,
-                    result.relative_error, result.discarded, tuple(history))
+    monitor = Monitor(progress)
+    frame = global_frame(signal, metric, monitor.tick)
+    monitor.unit = frame.scale**2
+    labels, vectors, left_out = _classify(frame, settings, monitor)
+    monitor.span(0.95, 1.0)
+    enough = _enough(frame, settings) if settings.target_error is not None else None
+    result = _finish(frame, labels, vectors, enough, monitor.tick)
+    monitor.note("done", float(result.discarded.sum()) / monitor.unit, 1.0)
+    return replace(result, history=tuple(monitor.history), adaptive_left_out=left_out)
 
 
 def pca(signal: NDArray[np.floating], vectors: int, metric: NDArray | None = None) -> Encoding:
@@ -110,60 +107,67 @@ def _enough(frame: GlobalFrame, settings: EncoderSettings) -> float:
 
 
 def _classify(frame: GlobalFrame, settings: EncoderSettings,
-              report: Callable[[str, float, float], None]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Every point's cluster and every cluster's number of vectors, by the method asked for."""
+              monitor: Monitor) -> tuple[NDArray[np.int32], NDArray[np.int64], bool]:
+    """Every point's cluster, every cluster's number of vectors, and whether the adaptive pass was left out."""
     if settings.clusters == 1 or frame.tail[0] <= ROUNDING * frame.energy:
-        return np.zeros(len(frame.coordinates), np.int32), np.array([settings.vectors])
+        return np.zeros(len(frame.coordinates), np.int32), np.array([settings.vectors]), False
     if settings.method == "static":
-        labels = static_labels(frame, settings)
-        return labels, np.full(int(labels.max()) + 1, settings.vectors)
-    enough = _enough(frame, settings)
-    share = 0.6 if settings.method == "adaptive" else 1.0
-    state = _best_start(frame, settings, enough, lambda stage, error, part: report(stage, error, share * part))
+        labels = static_labels(frame, settings, monitor)
+        return labels, np.full(int(labels.max()) + 1, settings.vectors), False
+    share = 0.6 if settings.method == "adaptive" else 0.95
+    state = _best_start(frame, settings, _enough(frame, settings), monitor, share)
+    left_out = False
     if settings.method == "adaptive":
-        adapt(frame, state, settings, lambda stage, error, part: report(stage, error, share + (1 - share) * part))
-    return state.labels, state.vectors
+        monitor.span(share, 0.95)
+        left_out = not adapt(frame, state, settings, monitor)
+    return state.labels, state.vectors, left_out
 
 
-def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float,
-                report: Callable[[str, float, float], None]) -> Subspaces:
+def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, monitor: Monitor,
+                share: float) -> Subspaces:
     """Iterative clustered PCA from one or more starts; the lowest squared error wins, the splits among equals.
 
     The iteration ends in a local minimum that depends on the start by some 10 % where clusters are few, and small
-    signals cost nothing, so they get several starts and more patience.
+    signals cost nothing, so they get several starts, more patience, and random exchanges of clusters from the best.
+    share: the fraction of the whole work that this is.
     """
     restarts = settings.restarts
     if restarts is None:
         restarts = min(START_BUDGET // (frame.coordinates.size * settings.clusters), MOST_STARTS)
     if restarts == 0 or settings.target_error is not None:
-        state = split_start(frame, settings, enough)
-        iterate(frame, state, settings, enough, report)
+        monitor.span(0.0, share)
+        state = split_start(frame, settings, enough, monitor)
+        iterate(frame, state, settings, enough, monitor)
         return state
     patient = replace(settings, tolerance=settings.tolerance / 10)
-    starts = [partial(split_start, frame, patient, enough, seed_vectors) for seed_vectors in (SEED_VECTORS, 0)]
-    starts += [partial(random_start, frame, patient, number) for number in range(restarts)]
+    starts: list[Callable[[], Subspaces]] = [
+        partial(split_start, frame, patient, enough, monitor, seed_vectors) for seed_vectors in (SEED_VECTORS, 0)]
+    starts += [partial(random_start, frame, patient, number, monitor) for number in range(restarts)]
     best, lowest = None, np.inf
     for number, start in enumerate(starts):
+        monitor.span(share * number / (len(starts) + 1), share * (number + 1) / (len(starts) + 1),
+                     f"start {number}, ")
         state = start()
-
-        def report_part(stage: str, error: float, fraction: float, number: int = number, least: float = lowest) -> None:
-            report(f"start {number}, {stage}", min(error, least), (number + fraction) / len(starts))
-        error = iterate(frame, state, patient, enough, report_part)
+        error = iterate(frame, state, patient, enough, monitor)
         if best is None or error < lowest:
             best, lowest = state, error
+    monitor.span(share * len(starts) / (len(starts) + 1), share)
+    disturb(frame, best, patient, enough, monitor, TRIALS_PER_START * restarts)
     return best
 
 
 def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64],
-            enough: float | None) -> Encoding:
+            enough: float | None, tick: Tick) -> Encoding:
     """Exact PCA of every cluster on all values, then back to the signal's own values.
 
     enough: squared error up to which the least useful vectors are left out again; None keeps all.
     """
     used, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(counts)[:-1])
-    fits = [principal_components(frame.coordinates[points], int(vectors[cluster]))
-            for cluster, points in zip(used, members, strict=True)]
+    fits = []
+    for cluster, points in zip(used, members, strict=True):
+        tick()
+        fits.append(principal_components(frame.coordinates[points], int(vectors[cluster])))
     scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:
@@ -173,6 +177,7 @@ def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.i
     weights = np.zeros((len(labels), most), np.float32)
     discarded = np.zeros(len(fits))
     for cluster, (points, (mean, axes, _)) in enumerate(zip(members, fits, strict=True)):
+        tick()
         axes = axes[:kept[cluster]]
         bases[cluster, 0], bases[cluster, 1:len(axes) + 1] = mean, axes
         for start in range(0, len(points), CHUNK):

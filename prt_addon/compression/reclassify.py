@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
+from .monitor import Tick, no_tick
 from .subspaces import Single, Subspaces
 
 # Points classified together: the arrays of one step stay in the cache and memory stays bounded.
@@ -37,15 +38,13 @@ class _Bases:
 
     @staticmethod
     def of(state: Subspaces) -> _Bases:
-        most = int(state.vectors.max(initial=0))
-        used = np.arange(most)[:, None, None] < state.vectors[None, :, None]
-        rows = np.where(used, state.bases[:, :most].transpose(1, 0, 2), np.float32(0))
-        own = np.stack([(rows[i].astype(np.float64) * state.means).sum(axis=1) for i in range(most)]) \
-            if most else np.zeros((0, len(state.means)))
-        return _Bases(np.ascontiguousarray(rows), state.means, own)
+        rows = state.vector_major()
+        own = np.stack([(vector.astype(np.float64) * state.means).sum(axis=1) for vector in rows]) \
+            if len(rows) else np.zeros((0, len(state.means)))
+        return _Bases(rows, state.means, own)
 
 
-def reclassify(data: Single, state: Subspaces) -> int:
+def reclassify(data: Single, state: Subspaces, tick: Tick = no_tick) -> int:
     """Give every point of data (p, d) to its nearest subspace, in place; returns how many points changed cluster.
 
     A point stays where it is unless another subspace is nearer; clusters without points win nothing.
@@ -57,6 +56,7 @@ def reclassify(data: Single, state: Subspaces) -> int:
         block = range(first, min(first + BLOCK, len(members)))
         offsets, apart = _offsets(state, bases, block), _mean_distances(state.means, block)
         for cluster, offset, distances in zip(block, offsets, apart, strict=True):
+            tick()
             if len(members[cluster]):
                 _reclassify_cluster(data, state, bases, members[cluster], cluster, offset, distances, labels)
     changed = int((labels != state.labels).sum())
@@ -89,8 +89,9 @@ def _reclassify_cluster(data: Single, state: Subspaces, bases: _Bases, members: 
     plane = np.sqrt(np.maximum(apart - np.add.reduce(offset * offset, axis=0), 0.0))
     plane[cluster] = np.inf
     plane[state.counts == 0] = np.inf
-    weights = state.weights[members]
-    lengths, own, rest = _split_lengths(state, weights, state.squares[members], cluster)
+    centred = data[members] - state.means[cluster]
+    weights = multiply(centred, state.bases[cluster].T)
+    lengths, own, rest = _split_lengths(weights, row_squares(centred), int(state.vectors[cluster]))
     reach = (lengths + own + rest) * np.float32(1 + SLACK)
     near = np.flatnonzero(plane < reach.max(initial=0.0))
     if len(near) == 0:
@@ -107,13 +108,12 @@ def _reclassify_cluster(data: Single, state: Subspaces, bases: _Bases, members: 
         if within == 0:
             continue
         possible = candidate.possible(within, inner, weights[rows], (own + rest)[rows] * np.float32(1 + SLACK))
-        _full_distances(data, candidate, possible, members[rows], state.means[cluster], own[rows], labels)
+        _full_distances(centred[rows], candidate, possible, members[rows], own[rows], labels)
 
 
-def _split_lengths(state: Subspaces, weights: Single, squares: Single, cluster: int) -> tuple[Single, Single, Single]:
+def _split_lengths(weights: Single, squares: Single, used: int) -> tuple[Single, Single, Single]:
     """Per point |u - mean| of its projection on all carried vectors, its distance to the own subspace with the vectors
-    in use, and r' with all carried ones."""
-    used = state.vectors[cluster]
+    in use, and r' with all carried ones. weights: (m, q); squares: (m,) squared distances to the own mean."""
     inside, spare = row_squares(weights[:, :used]), row_squares(weights[:, used:])
     own = np.maximum(squares - inside, 0.0)
     return np.sqrt(inside + spare), np.sqrt(own), np.sqrt(np.maximum(own - spare, 0.0))
@@ -166,15 +166,15 @@ class _Candidates:
                            self.offset[:, chosen], self.plane[chosen])
 
 
-def _full_distances(data: Single, candidate: _Candidates, possible: NDArray[np.bool_], points: NDArray[np.intp],
-                    mean: Single, own: Single, labels: NDArray[np.int32]) -> None:
-    """Full distances of the points that another subspace may win; the nearest takes them."""
+def _full_distances(centred: Single, candidate: _Candidates, possible: NDArray[np.bool_], points: NDArray[np.intp],
+                    own: Single, labels: NDArray[np.int32]) -> None:
+    """Full distances of the points, centred (m, d) on their own mean, that another subspace may win; the nearest takes
+    them."""
     columns = np.flatnonzero(possible.any(axis=0))
     if len(columns) == 0:
         return
     chosen = candidate.subset(np.flatnonzero(possible[:, columns].any(axis=1)))
-    points = points[columns]
-    offsets = data[points] - mean
+    points, offsets = points[columns], centred[columns]
     squared = chosen._squared(chosen.rows, chosen.shift, len(chosen.clusters), offsets, row_squares(offsets))
     best = squared.argmin(axis=0)
     wins = squared[best, np.arange(len(points))] < own[columns] ** 2

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
+from .monitor import Tick, no_tick
 from .subspaces import SPARE, Fit, Single, fit_subspace, squared_distances
 
 # Alternations of fitting both halves and reassigning their points.
-ROUNDS = 4
+ROUNDS = 3
 # Share of the scatter below which an error in single precision is rounding.
 CANCELLATION = 1e-4
 
@@ -35,24 +36,29 @@ class _Leaf:
     halves: tuple[_Leaf, _Leaf] | None = field(compare=False, default=None)
 
 
-def split_points(points: Single, whole: Fit, vectors: int) -> tuple[NDArray[np.bool_], Fit, Fit] | None:
+def split_points(points: Single, whole: Fit, vectors: int) -> tuple[NDArray[np.bool_], Fit, Fit, Single] | None:
     """Divide points (m, d) between two subspaces of few vectors; None where they cannot be divided.
 
-    whole: the fit of all the points. The first division is by the sign of the first weight.
+    whole: the fit of all the points. The first division is by the sign of the first weight. Returns which points are
+    the second half's, the fits of the divisions before the last, and the squared distances to the nearer one (m,),
+    whose sum the halves' own fits can only lower.
     """
     basis = whole.basis
-    side = whole.weights[:, 0] > 0
+    side = multiply(points - whole.mean, basis[:1].T)[:, 0] > 0
+    result = None
     for _ in range(ROUNDS):
-        if not 0 < side.sum() < len(side):
-            return None
+        if not 0 < np.count_nonzero(side) < len(side):
+            break
         fits = fit_subspace(points[~side], basis), fit_subspace(points[side], basis)
-        now = squared_distances(points, fits[1], vectors) < squared_distances(points, fits[0], vectors)
+        first, second = (squared_distances(points, fit, vectors) for fit in fits)
+        now = second < first
+        if not 0 < np.count_nonzero(now) < len(now):
+            break
+        result = now, *fits, np.minimum(first, second)
         if np.array_equal(now, side):
             break
         side = now
-    if not 0 < side.sum() < len(side):
-        return None
-    return side, fit_subspace(points[~side], fits[0].basis), fit_subspace(points[side], fits[1].basis)
+    return result
 
 
 def fit_error(points: Single, fit: Fit, vectors: int) -> float:
@@ -61,17 +67,17 @@ def fit_error(points: Single, fit: Fit, vectors: int) -> float:
     The difference of scatter and D_i^2 is rounding alone where nearly everything is explained (points of very different
     scale); only then are the residuals themselves formed.
     """
-    scatter = fit.squares.sum(dtype=np.float64)
-    error = float(scatter - fit.spread[:vectors].sum())
-    if error > CANCELLATION * scatter:
+    error = float(fit.scatter - fit.spread[:vectors].sum())
+    if error > CANCELLATION * fit.scatter:
         return error
-    residuals = points - fit.mean - multiply(fit.weights[:, :vectors], fit.basis[:vectors])
+    centred = points - fit.mean
+    residuals = centred - multiply(multiply(centred, fit.basis[:vectors].T), fit.basis[:vectors])
     return float(row_squares(residuals).sum(dtype=np.float64))
 
 
-def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width: Callable[[float], int]) \
-        -> NDArray[np.int32]:
-    """Labels (p,) of at most `clusters` clusters of data (p, d); stops early at a squared error of `enough`.
+def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width: Callable[[float], int],
+                tick: Tick = no_tick) -> tuple[NDArray[np.int32], float]:
+    """Labels (p,) of at most `clusters` clusters of data (p, d) and their squared error; stops early at `enough`.
 
     width: how many leading values to work on at a squared error; splits start on few values and get more.
     """
@@ -85,6 +91,7 @@ def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width:
     done: list[_Leaf] = []
     made = 1
     while queue and len(queue) + len(done) < clusters and error > enough:
+        tick()
         leaf = heapq.heappop(queue)
         if leaf.halves is None:
             leading = max(leading, width(error))
@@ -104,7 +111,7 @@ def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width:
     labels = np.zeros(len(data), np.int32)
     for label, leaf in enumerate(sorted(queue + done, key=lambda leaf: leaf.members[0])):
         labels[leaf.members] = label
-    return labels
+    return labels, error
 
 
 def _judge(data: Single, leaf: _Leaf, vectors: int, number: int) -> None:
@@ -116,8 +123,11 @@ def _judge(data: Single, leaf: _Leaf, vectors: int, number: int) -> None:
     split = split_points(points, whole, vectors)
     if split is None:
         return
-    side, left, right = split
-    errors = fit_error(points[~side], left, vectors), fit_error(points[side], right, vectors)
-    leaf.halves = (_Leaf(-errors[0], number, leaf.members[~side], left.basis, errors[0]),
-                   _Leaf(-errors[1], number, leaf.members[side], right.basis, errors[1]))
+    side, left, right, squared = split
+    halves = (leaf.members[~side], left), (leaf.members[side], right)
+    errors = [float(squared[half].sum(dtype=np.float64)) for half in (~side, side)]
+    if sum(errors) < CANCELLATION * whole.scatter:  # rounding of the distances alone
+        errors = [fit_error(data[members], fit_subspace(data[members], fit.basis), vectors) for members, fit in halves]
+    leaf.halves = tuple(_Leaf(-error, number, members, fit.basis, error)
+                        for (members, fit), error in zip(halves, errors, strict=True))
     leaf.key = sum(errors) - leaf.error

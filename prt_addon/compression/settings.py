@@ -22,7 +22,8 @@ class EncoderSettings:
     target_error: squared error relative to the signal's own sum of squares at which to stop; None uses every cluster
         and vector. The error reached is at most this wherever the clusters and vectors allowed suffice.
     vectors_limit: most vectors of one cluster in the adaptive method; None allows twice `vectors`.
-    tolerance: relative decrease of the squared error below which iterations stop.
+    tolerance: relative decrease of the squared error below which iterations stop; a tenth of the default lowers the
+        error by some 4 % in two to three times the time.
     restarts: how many of the paper's random starts to try beside the splits; None lets the signal's size decide, and a
         target_error makes do with the splits.
     """
@@ -34,7 +35,7 @@ class EncoderSettings:
     iterations: int = 20
     target_error: float | None = None
     vectors_limit: int | None = None
-    tolerance: float = 0.005
+    tolerance: float = 0.0075
     restarts: int | None = None
 
     def __post_init__(self) -> None:

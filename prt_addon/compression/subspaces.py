@@ -1,46 +1,51 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Affine subspaces, one per cluster, and their warm update by one block power step and a Rayleigh-Ritz problem.
+"""Affine subspaces, one per cluster, and their update from the points classified to them.
 
 Kambhatla and Leen's local PCA needs the leading eigenvectors of each cluster's covariance after every classification.
-As clusters change little between classifications, one step of block power iteration from the last vectors (W = C B^T,
-Z = C^T W) follows them without ever forming an n x n matrix; a Rayleigh-Ritz problem of the block's size orders them.
+In few values the covariance is small and solved outright. In many, clusters change little between classifications, so
+one step of block power iteration from the last vectors (W = C B^T, Z = C^T W) follows them without ever forming an
+n x n matrix; a Rayleigh-Ritz problem of the block's size orders them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares, small_generalized_eigenpairs, small_symmetric_eigenpairs
+from .monitor import Tick, no_tick
 
 # Trailing vectors carried beyond those in use: they speed up the power iteration, are ready when a vector is added, and
 # sharpen the bounds of the reclassification.
 SPARE = 2
+# Values up to which a cluster's whole eigenproblem costs less than a power step.
+NARROW = 32
+# Eigenvalues below this share of the largest are rounding of single-precision data.
+NEGLIGIBLE = 1e-13
 
 Single = NDArray[np.float32]
 
 
 class Fit(NamedTuple):
     """One cluster's subspace: mean (d,), orthonormal rows or zeros basis (q, d), squared singular values spread (q,),
-    weights (m, q) and squared distances to the mean (m,) of its points."""
+    and the summed squared distance of its points to the mean."""
 
     mean: Single
     basis: Single
     spread: NDArray[np.float64]
-    weights: Single
-    squares: Single
+    scatter: float
 
 
 @dataclass
 class Subspaces:
-    """State of an encode: K affine subspaces and each point's place in its own.
+    """State of an encode: K affine subspaces and each point's cluster.
 
     means (K, d); bases (K, q, d), rows orthonormal or zero; spread (K, q) float64, D_i^2; vectors (K,) how many of
-    the q are in use; counts (K,); scatter (K,) float64, summed squared distance to the mean; labels (p,) int32;
-    weights (p, q) in the own subspace; squares (p,) squared distance to the own mean.
+    the q are in use; counts (K,); scatter (K,) float64, summed squared distance to the mean; labels (p,) int32.
     """
 
     means: Single
@@ -50,8 +55,6 @@ class Subspaces:
     counts: NDArray[np.int64]
     scatter: NDArray[np.float64]
     labels: NDArray[np.int32]
-    weights: Single
-    squares: Single
 
     @property
     def errors(self) -> NDArray[np.float64]:
@@ -64,20 +67,44 @@ class Subspaces:
         """Squared error over all points, in the values worked on."""
         return float(self.errors.sum())
 
+    def copy(self) -> Subspaces:
+        """An independent copy."""
+        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
+
+    def assign(self, other: Subspaces) -> None:
+        """Take over another state's arrays."""
+        vars(self).update(vars(other))
+
     def members(self) -> list[NDArray[np.intp]]:
         """The points of each cluster, in ascending order."""
-        order = np.argsort(self.labels, kind="stable")
-        return np.split(order, np.cumsum(np.bincount(self.labels, minlength=len(self.means)))[:-1])
+        order, ends = by_cluster(self.labels, len(self.means))
+        return [order[start:end] for start, end in itertools.pairwise(ends)]
 
     def resize(self, values: int, block: int) -> None:
         """Work on `values` leading values with `block` vectors per cluster: zeros are added or the last ones cut."""
-        def fitted(array: NDArray, axis: int, size: int) -> NDArray:
-            cut = np.take(array, np.arange(min(size, array.shape[axis])), axis=axis)
-            return np.pad(cut, [(0, size - cut.shape[axis]) if i == axis else (0, 0) for i in range(array.ndim)])
-        self.means = fitted(self.means, 1, values)
-        self.bases = fitted(fitted(self.bases, 2, values), 1, block)
-        self.spread = fitted(self.spread, 1, block)
-        self.weights = fitted(self.weights, 1, block)
+        self.means = _fitted(self.means, 1, values)
+        self.bases = _fitted(_fitted(self.bases, 2, values), 1, block)
+        self.spread = _fitted(self.spread, 1, block)
+
+    def vector_major(self) -> Single:
+        """The vectors in use (q, K, d), zero where a cluster has fewer."""
+        most = int(self.vectors.max(initial=0))
+        used = np.arange(most)[:, None, None] < self.vectors[None, :, None]
+        return np.where(used, self.bases[:, :most].transpose(1, 0, 2), np.float32(0))
+
+
+def _fitted(array: NDArray, axis: int, size: int) -> NDArray:
+    """An axis of an array brought to a size: zeros are added or the last entries cut."""
+    if array.shape[axis] == size:
+        return array
+    cut = np.take(array, np.arange(min(size, array.shape[axis])), axis=axis)
+    return np.pad(cut, [(0, size - cut.shape[axis]) if i == axis else (0, 0) for i in range(array.ndim)])
+
+
+def by_cluster(labels: NDArray[np.int32], clusters: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The points ordered by label, ascending within one, and where each label's points start and the last's end."""
+    order = np.argsort(labels.astype(np.uint16) if clusters <= 1 << 16 else labels, kind="stable")
+    return order, np.append(0, np.cumsum(np.bincount(labels, minlength=clusters)))
 
 
 def orthonormal_rows(rows: Single) -> Single:
@@ -99,19 +126,43 @@ def orthonormal_rows(rows: Single) -> Single:
 
 
 def fit_subspace(points: Single, start: Single) -> Fit:
-    """Fit an affine subspace to points (m, d) by one power step and Rayleigh-Ritz from the rows of start (q, d).
+    """Fit an affine subspace to points (m, d): exactly where they have few values or vectors are many, else by one
+    power step from the rows of start (q, d)."""
+    mean = np.add.reduce(points, axis=0)
+    mean /= len(points)
+    centred = points - mean
+    block, values = start.shape
+    if block == 0:
+        return Fit(mean, start, np.zeros(0), float(row_squares(centred).sum(dtype=np.float64)))
+    if values <= max(NARROW, block):
+        return _solve(mean, centred, block)
+    return _power_step(mean, centred, start)
+
+
+def _solve(mean: Single, centred: Single, block: int) -> Fit:
+    """The leading eigenvectors of the covariance of centred points (m, d)."""
+    double = centred.astype(np.float64)
+    covariance = multiply(double.T, double)
+    squares, columns = small_symmetric_eigenpairs(covariance)
+    block, most = min(block, len(squares)), block
+    basis = np.zeros((most, len(mean)), np.float32)
+    spread = np.zeros(most)
+    spread[:block] = squares[:block]
+    spread[spread < NEGLIGIBLE * spread[0]] = 0.0
+    basis[:block] = columns[:, :block].T
+    basis[spread <= 0.0] = 0.0
+    return Fit(mean, basis, np.maximum(spread, 0.0), float(covariance.trace()))
+
+
+def _power_step(mean: Single, centred: Single, start: Single) -> Fit:
+    """One power step and Rayleigh-Ritz on centred points (m, d) from the rows of start (q, d).
 
     The rows Z of one power step are scaled to unit length; the subspace's best vectors then solve
     (C Z^T)^T (C Z^T) v = D^2 (Z Z^T) v, C the centred points: orthonormalization and Rayleigh-Ritz in one problem.
     Rows of start that are zero are first replaced by differences of the points farthest from the subspace, so that a
     block grows into directions that it has not seen.
     """
-    mean = np.add.reduce(points, axis=0)
-    mean /= len(points)
-    centred = points - mean
     squares = row_squares(centred)
-    if start.shape[0] == 0:
-        return Fit(mean, start, np.zeros(0), np.zeros((len(points), 0), np.float32), squares)
     start = _fill(centred, squares, start)
     rows = multiply(multiply(start, centred.T), centred)
     rows /= np.maximum(np.sqrt(row_squares(rows)), np.float32(1e-30))[:, None]
@@ -124,8 +175,8 @@ def fit_subspace(points: Single, start: Single) -> Fit:
         rows = orthonormal_rows(rows)
         weights = multiply(centred, rows.T)
         solved = small_symmetric_eigenpairs(multiply(weights.T, weights).astype(np.float64))
-    rotation = solved[1].astype(np.float32)
-    return Fit(mean, multiply(rotation.T, rows), np.maximum(solved[0], 0.0), multiply(weights, rotation), squares)
+    return Fit(mean, multiply(solved[1].astype(np.float32).T, rows), np.maximum(solved[0], 0.0),
+               float(squares.sum(dtype=np.float64)))
 
 
 def _fill(centred: Single, squares: Single, start: Single) -> Single:
@@ -144,33 +195,62 @@ def _fill(centred: Single, squares: Single, start: Single) -> Single:
 def squared_distances(points: Single, fit: Fit, vectors: int) -> Single:
     """Squared distances of points (m, d) to a subspace spanned by its leading vectors (section 4.2)."""
     centred = points - fit.mean
-    return np.maximum(row_squares(centred) - row_squares(multiply(centred, fit.basis[:vectors].T)), 0.0)
+    squared = row_squares(centred)
+    if vectors:
+        squared -= row_squares(multiply(centred, fit.basis[:vectors].T))
+    return np.maximum(squared, 0.0, out=squared)
 
 
 def from_labels(labels: NDArray[np.int32], clusters: int, values: int, vectors: int) -> Subspaces:
     """Unfitted subspaces for a given classification of points; call `update` next."""
-    block = vectors + SPARE if vectors else 0
-    points = len(labels)
+    block = vectors + SPARE
     return Subspaces(
         means=np.zeros((clusters, values), np.float32), bases=np.zeros((clusters, block, values), np.float32),
         spread=np.zeros((clusters, block)), vectors=np.full(clusters, vectors, np.int64),
-        counts=np.zeros(clusters, np.int64), scatter=np.zeros(clusters), labels=labels.astype(np.int32),
-        weights=np.zeros((points, block), np.float32), squares=np.zeros(points, np.float32))
+        counts=np.zeros(clusters, np.int64), scatter=np.zeros(clusters), labels=labels.astype(np.int32))
 
 
-def update(data: Single, state: Subspaces) -> float:
+def update(data: Single, state: Subspaces, tick: Tick = no_tick) -> float:
     """Fit every subspace to its points of data (p, d), in place; returns the squared error in these values.
 
     A cluster without points keeps its subspace and counts nothing.
     """
-    for cluster, members in enumerate(state.members()):
-        state.counts[cluster] = len(members)
-        if len(members) == 0:
-            state.spread[cluster] = 0.0
-            state.scatter[cluster] = 0.0
-            continue
-        fit = fit_subspace(data[members], state.bases[cluster])
-        state.means[cluster], state.bases[cluster], state.spread[cluster] = fit.mean, fit.basis, fit.spread
-        state.scatter[cluster] = fit.squares.sum(dtype=np.float64)
-        state.weights[members], state.squares[members] = fit.weights, fit.squares
+    order, ends = by_cluster(state.labels, len(state.means))
+    state.counts = np.diff(ends)
+    block, values = state.bases.shape[1:]
+    if block > 0 and values <= max(NARROW, block):
+        _solve_all(data, order, ends, state, tick)
+        return state.error
+    state.spread[state.counts == 0] = 0.0
+    state.scatter[state.counts == 0] = 0.0
+    for cluster in np.flatnonzero(state.counts):
+        tick()
+        fit = fit_subspace(data[order[ends[cluster]:ends[cluster + 1]]], state.bases[cluster])
+        state.means[cluster], state.bases[cluster], state.spread[cluster], state.scatter[cluster] = fit
     return state.error
+
+
+def _solve_all(data: Single, order: NDArray[np.intp], ends: NDArray[np.intp], state: Subspaces, tick: Tick) -> None:
+    """Exact subspaces of all clusters from their second moments in double precision, of which the means' part is taken
+    off afterwards; what can be is done for all clusters in one call."""
+    block, values = state.bases.shape[1:]
+    filled = np.flatnonzero(state.counts)
+    grouped = data[order].astype(np.float64)
+    counts = state.counts[filled][:, None]
+    means = np.add.reduceat(grouped, ends[filled], axis=0) / counts
+    squares, columns = np.zeros((len(filled), values)), np.empty((len(filled), values, values))
+    scatter = np.empty(len(filled))
+    for row, (start, end, mean) in enumerate(zip(ends[filled], ends[filled + 1], means, strict=True)):
+        tick()
+        points = grouped[start:end]
+        points -= mean
+        covariance = multiply(points.T, points)
+        scatter[row] = covariance.trace()
+        squares[row], columns[row] = small_symmetric_eigenpairs(covariance)
+    state.spread[:], state.scatter[:] = 0.0, 0.0
+    spread, used = squares[:, :block], min(block, values)
+    spread[spread < NEGLIGIBLE * spread[:, :1]] = 0.0
+    state.means[filled], state.scatter[filled] = means, scatter
+    state.spread[filled, :used] = spread
+    state.bases[filled] = 0.0
+    state.bases[filled, :used] = columns[:, :, :used].transpose(0, 2, 1) * (spread > 0)[:, :, None]

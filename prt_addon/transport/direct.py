@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..basis.spherical_harmonics import evaluate, expand_bands, zonal_cosine
 from ..linear_algebra import multiply
 from ..tracing.tracer import Tracer
-from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated
+from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated, weigh_by_faces
 
 # Directions per task: long enough to hide a task's overhead behind 64 x 32,000 rays, short enough to cancel at once.
 CHUNK = 64
@@ -85,16 +85,14 @@ def _cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: sli
     """
     cosines = facing_cosines(directions, receivers.normals[place])
     visible = cosines.copy()
-    origins, grazing = receivers.origins[place], receivers.grazing[place]
-    rays = 0
-    for index, direction in enumerate(directions):
-        low = np.flatnonzero((cosines[index] > 0.0) & (cosines[index] < grazing))
-        visible[index, low] *= receivers.above_faces(low + place.start, direction)
-        if tracer is None:
-            continue
-        facing = np.flatnonzero(visible[index] > 0.0)
+    weigh_by_faces(receivers, place, directions, visible)
+    if tracer is None:
+        return cosines, visible, 0
+    origins, rays = receivers.origins[place], 0
+    for index in range(len(directions)):
+        facing = np.flatnonzero(visible[index])
         rays += len(facing)
-        hit = tracer.occluded(np.take(origins, facing, axis=0), direction[None, :])
+        hit = tracer.occluded(np.take(origins, facing, axis=0), directions[index:index + 1])
         visible[index, facing[hit]] = 0.0
     return cosines, visible, rays
 

@@ -19,7 +19,7 @@ from scipy import sparse
 from ..linear_algebra import multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
-from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated
+from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated, weigh_by_faces
 
 CHUNK = 16
 # Receivers of this many generations are traced for what they see; what the last of them sees beyond is counted as lost.
@@ -159,25 +159,19 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
 def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task) -> tuple[_Entries, int]:
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
-    origins, grazing = receivers.origins[place], receivers.grazing[place]
     cosines = facing_cosines(task.directions, receivers.normals[place])
-    result, rays = _Entries([], [], []), 0
-    for index, direction in enumerate(task.directions):
-        low = np.flatnonzero((cosines[index] > 0.0) & (cosines[index] < grazing))
-        cosines[index, low] *= receivers.above_faces(low + place.start, direction)
-        facing = np.flatnonzero(cosines[index] > 0.0)
-        rays += len(facing)
-        hits = tracer.nearest(np.take(origins, facing, axis=0), direction[None, :])
-        met = np.flatnonzero(hits.triangle >= 0)
-        row = facing[met]
-        share = cosines[index, row] * task.weights[index, row]
-        side = np.where(hits.front[met], 0, len(scene.points))
-        corner = scene.triangles[hits.triangle[met]].astype(np.int64) + side[:, None]
-        u, v = hits.u[met], hits.v[met]
-        result.row.append(np.repeat(row, 3))
-        result.key.append(corner.ravel())
-        result.value.append((np.stack([1.0 - u - v, u, v], axis=1) * share[:, None]).ravel().astype(np.float32))
-    return result, rays
+    weigh_by_faces(receivers, place, task.directions, cosines)
+    which, row = np.nonzero(cosines)
+    rays = len(row)
+    hits = tracer.nearest(np.take(receivers.origins[place], row, axis=0), np.take(task.directions, which, axis=0))
+    met = np.flatnonzero(hits.triangle >= 0)
+    which, row = which[met], row[met]
+    share = cosines[which, row] * task.weights[which, row]
+    side = np.where(hits.front[met], 0, len(scene.points))
+    corner = scene.triangles[hits.triangle[met]].astype(np.int64) + side[:, None]
+    u, v = hits.u[met], hits.v[met]
+    value = (np.stack([1.0 - u - v, u, v], axis=1) * share[:, None]).astype(np.float32)
+    return _Entries([np.repeat(row, 3)], [corner.ravel()], [value.ravel()]), rays
 
 
 def _block_matrix(entries: _Entries, rows: int, columns: int) -> sparse.csr_matrix:

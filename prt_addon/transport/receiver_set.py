@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.directions import random_rotation
+from ..linear_algebra import multiply
 from ..scene.receivers import adjacent_faces, morton_order, ray_origins
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
@@ -17,6 +18,8 @@ from ..tracing.tracer import Tracer
 # Receivers handled at once: 64 directions of them in single precision are 4 MB, which the allocator reuses (larger
 # arrays are given back to the system and their pages cleared anew at each task).
 BLOCK = 16384
+# Directions whose pairs with receivers near their horizon are weighed in one go: their numbers stay in the cache.
+AT_ONCE = 8
 
 
 @dataclass(frozen=True)
@@ -106,15 +109,23 @@ def blocks(count: int, group: int, seed: int) -> Iterator[Block]:
 
 
 def facing_cosines(directions: NDArray[np.float32], normals: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Clamped cosines (d, b) float32 between directions (d, 3) and normals (b, 3).
-
-    Summed by numpy, not by BLAS: three terms gain nothing from it, and numpy lets the other threads trace meanwhile.
-    """
-    x, y, z = normals.astype(np.float32).T
-    cosines = directions[:, :1] * x
-    cosines += directions[:, 1:2] * y
-    cosines += directions[:, 2:] * z
+    """Clamped cosines (d, b) float32 between directions (d, 3) and normals (b, 3)."""
+    cosines = multiply(directions, normals.astype(np.float32).T)
     return np.maximum(cosines, np.float32(0.0), out=cosines)
+
+
+def weigh_by_faces(receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
+                   cosines: NDArray[np.float32]) -> None:
+    """Multiply clamped cosines (d, b) of a block of receivers, in place, by the share of faces that each direction
+    (d, 3) lies above. Only directions near the horizon can lie under a face, so only those are looked at."""
+    block = cosines.shape[1]
+    grazing = receivers.grazing[place]
+    for start in range(0, len(directions), AT_ONCE):
+        part = cosines[start:start + AT_ONCE]
+        low = np.flatnonzero((part > 0.0) & (part < grazing))
+        which = low // block
+        towards = np.take(directions[start:start + AT_ONCE], which, axis=0)
+        part.reshape(-1)[low] *= receivers.above_faces(low - which * block + place.start, towards)
 
 
 def rotated(directions: NDArray[np.float64], rotation: NDArray[np.float64] | None) -> NDArray[np.float64]:
