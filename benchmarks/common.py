@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # a script's own process, not Blender's
 
-from prt_addon.scene.object_mesh import ObjectMesh  # noqa: E402
+from prt_addon.scene.object_mesh import ObjectMesh
 
 MESHES = ROOT.parent / "shared" / "data" / "meshes"
 
