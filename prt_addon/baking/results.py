@@ -157,6 +157,9 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
                              "a second receiver at each point seen from behind"))
     for name, encoding in encodings.items():
         used, most = len(encoding.vectors_per_cluster), most_clusters(settings.clusters, len(encoding.cluster))
+        if encoding.adaptive_left_out:
+            found.append(LeftOut(f"the adaptive pass for {name}", "its clusters' errors are even",
+                                 "redistributing vectors among clusters"))
         if used < settings.clusters:
             why = (f"{len(encoding.cluster)} receivers fill no more" if used == most else
                    f"the compression error {encoding.relative_error ** 0.5:.1e} is reached without them")
