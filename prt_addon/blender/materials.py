@@ -10,6 +10,7 @@ is not lost but reflected.
 from __future__ import annotations
 
 import hashlib
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cycles_bake import evaluate_corners, scratch_scene
-from .nodes import constant_of, copy_groups, signature, source_of
+from .nodes import constant_of, copy_groups, path_of, reachable, shown_images, signature, source_of
 
 if TYPE_CHECKING:
     from .read_scene import MeshArrays
@@ -89,14 +90,28 @@ class _Request:
     result: NDArray[np.float32]
 
 
+def missing_images(material: bpy.types.Material) -> list[str]:
+    """A line for each image of a material that Cycles can't find: it shows magenta there, and bakes magenta."""
+    output = material.node_tree.get_output_node("CYCLES") if material.node_tree is not None else None
+    if output is None:
+        return []
+    empty = [f"Material {material.name}: an image texture node has no image, which shows black"
+             for node in reachable(output)
+             if node.bl_idname == "ShaderNodeTexImage" and not node.mute and node.image is None]
+    lost = [path_of(image) or image.name for image in shown_images(output)
+            if image.source == "FILE" and image.packed_file is None and not os.path.isfile(path_of(image))]
+    return empty + [f"Material {material.name}: its image {path} does not exist and shows magenta" for path in lost]
+
+
 class AlbedoReader:
     """Fills corner albedos: at once where colours are plain, the rest in one go at the end with Cycles.
 
     In one go, because evaluating adds data to the file, which is not allowed while the depsgraph is being iterated.
     """
 
-    def __init__(self, scene: bpy.types.Scene) -> None:
+    def __init__(self, scene: bpy.types.Scene, warnings: list[str]) -> None:
         self._scene = scene
+        self._warnings = warnings
         self._requests: list[_Request] = []
         self._constants: dict[bpy.types.Material | None, tuple[float, float, float] | None] = {}
 
@@ -118,6 +133,8 @@ class AlbedoReader:
     def _constant(self, material: bpy.types.Material | None) -> tuple[float, float, float] | None:
         if material not in self._constants:
             self._constants[material] = constant_albedo(material)
+            if material is not None and self._constants[material] is None:
+                self._warnings += missing_images(material)
         return self._constants[material]
 
     def evaluate(self) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Hashable, Iterator
 
 import bpy
@@ -114,3 +115,29 @@ def _value(value: object) -> Hashable:
     if value is None or isinstance(value, (str, int, float, bool)):
         return value
     return tuple(_value(v) for v in value)
+
+
+def reachable(output: bpy.types.Node) -> Iterator[bpy.types.Node]:
+    """Every node that a tree's output depends on, groups opened whole."""
+    pending, seen = [output], set()
+    while pending:
+        node = pending.pop()
+        if node.as_pointer() in seen:
+            continue
+        seen.add(node.as_pointer())
+        yield node
+        pending.extend(link.from_node for socket in node.inputs for link in socket.links if not link.is_muted)
+        if isinstance(getattr(node, "node_tree", None), bpy.types.NodeTree):
+            for part in walk(node.node_tree):
+                yield from part.nodes
+
+
+def shown_images(output: bpy.types.Node) -> list[bpy.types.Image]:
+    """Images that an output node shows, in a stable order."""
+    found = [node.image for node in reachable(output) if isinstance(getattr(node, "image", None), bpy.types.Image)]
+    return list(dict.fromkeys(found))
+
+
+def path_of(image: bpy.types.Image) -> str:
+    """The image's file, or an empty text."""
+    return os.path.normpath(bpy.path.abspath(image.filepath, library=image.library)) if image.filepath else ""

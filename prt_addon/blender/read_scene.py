@@ -65,7 +65,7 @@ def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | N
     warnings = [] if warnings is None else warnings
     with shown_as_in_render(depsgraph) as visible:
         targets = _targets(depsgraph, visible, target_names)
-        albedo_reader = AlbedoReader(depsgraph.scene)
+        albedo_reader = AlbedoReader(depsgraph.scene, warnings)
         gathered = _gather(depsgraph, visible, albedo_reader, warnings)
         _check_targets(targets, gathered, visible)
         albedo_reader.evaluate()

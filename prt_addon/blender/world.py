@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 
 import bpy
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import BadScene, PRTError
 from ..lighting.environment import band_energies, check_finite, load_equirectangular, project, total_energy
 from ..lighting.reference_light import REFERENCE_WIDTH, averaged
-from .nodes import constant_of, signature, source_of, walk
+from .nodes import constant_of, path_of, reachable, shown_images, signature, source_of
 from .world_render import render_world
 
 HIGHEST_ORDER = 10
@@ -192,44 +192,19 @@ def _euler_matrix(x: float, y: float, z: float) -> NDArray[np.float64]:
                      [-sy, cy * sx, cy * cx]])
 
 
-def reachable(output: bpy.types.Node) -> Iterator[bpy.types.Node]:
-    """Every node that a tree's output depends on, groups opened whole."""
-    pending, seen = [output], set()
-    while pending:
-        node = pending.pop()
-        if node.as_pointer() in seen:
-            continue
-        seen.add(node.as_pointer())
-        yield node
-        pending.extend(link.from_node for socket in node.inputs for link in socket.links if not link.is_muted)
-        if isinstance(getattr(node, "node_tree", None), bpy.types.NodeTree):
-            for part in walk(node.node_tree):
-                yield from part.nodes
-
-
-def _images(output: bpy.types.Node) -> list[bpy.types.Image]:
-    """Images that the World shows, in a stable order."""
-    found = [node.image for node in reachable(output) if isinstance(getattr(node, "image", None), bpy.types.Image)]
-    return list(dict.fromkeys(found))
-
-
 def _check_images(world: bpy.types.World, output: bpy.types.Node) -> None:
     """Raise PRTError where Cycles would quietly show magenta: a missing file, or an HDRI node without an image."""
     for node in reachable(output):
         if node.bl_idname == "ShaderNodeTexEnvironment" and not node.mute and node.image is None:
             raise PRTError(f"World {world.name}", "its Environment Texture has no image",
                            "Choose an image, or remove the node")
-    for image in _images(output):
-        if image.source == "FILE" and image.packed_file is None and not os.path.isfile(_path_of(image)):
-            raise PRTError(_path_of(image) or image.name, f"the image of World {world.name} does not exist",
+    for image in shown_images(output):
+        if image.source == "FILE" and image.packed_file is None and not os.path.isfile(path_of(image)):
+            raise PRTError(path_of(image) or image.name, f"the image of World {world.name} does not exist",
                            CHOOSE_IMAGE)
         if image.source == "FILE" and 0 in tuple(image.size):
-            raise PRTError(_path_of(image) or image.name, f"Blender can't read the image of World {world.name}",
+            raise PRTError(path_of(image) or image.name, f"Blender can't read the image of World {world.name}",
                            CHOOSE_IMAGE)
-
-
-def _path_of(image: bpy.types.Image) -> str:
-    return os.path.normpath(bpy.path.abspath(image.filepath, library=image.library)) if image.filepath else ""
 
 
 def _image_key(image: bpy.types.Image) -> Hashable:
@@ -238,7 +213,7 @@ def _image_key(image: bpy.types.Image) -> Hashable:
         return None
     if image.packed_file is not None:
         return "packed", image.name_full, image.packed_file.size, image.session_uid
-    path = _path_of(image)
+    path = path_of(image)
     return "file", path, os.stat(path).st_mtime_ns, image.colorspace_settings.name, image.alpha_mode
 
 
@@ -249,13 +224,13 @@ def _image_pixels(image: bpy.types.Image) -> NDArray[np.float32]:
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(height, width, image.channels)[::-1, :, :3]
     colours = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels
-    check_finite(colours, _path_of(image) or image.name)
+    check_finite(colours, path_of(image) or image.name)
     return colours
 
 
 def _by_cycles(scene: bpy.types.Scene, world: bpy.types.World, output: bpy.types.Node) -> EnvironmentSource:
     """Any other World, evaluated; cached by all values of its nodes."""
-    images = _images(output)
+    images = shown_images(output)
     keys = [_image_key(image) if image.source in {"FILE", "GENERATED"} else ("frame", image.name_full)
             for image in images]
     cacheable = not any(key is None for key in keys)

@@ -107,9 +107,8 @@ def _planes(means: Single, rows: Single, lists: NDArray[np.intp], first: int) ->
     shift = means[lists] - means[first:first + block, None]
     planes = np.concatenate([rows[:, lists], shift[None]]).transpose(1, 0, 2, 3)
     planes = np.ascontiguousarray(planes)
-    offsets = np.vecdot(planes[:, :-1], shift[:, None])
-    return (planes.reshape(block, -1, means.shape[1]), offsets.reshape(block, -1, 1),
-            np.vecdot(shift, shift)[:, :, None])
+    offsets = (planes[:, :-1] * shift[:, None]).sum(axis=-1)
+    return planes.reshape(block, -1, means.shape[1]), offsets.reshape(block, -1, 1), row_squares(shift)[:, :, None]
 
 
 def _squared(centred: Single, planes: Single, offsets: Single, lengths: Single) -> Single:

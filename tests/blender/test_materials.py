@@ -221,3 +221,20 @@ def test_digest_follows_values_links_and_groups(scene: bpy.types.Scene) -> None:
     assert len(set(digests)) == 3
     nodes["ShaderNodeTexChecker"].location = (400, 10)
     assert materials.material_digest([material]) == digests[-1]
+
+
+def test_a_missing_image_is_named(scene: bpy.types.Scene) -> None:
+    material = add_material("Poster", colour_through("ShaderNodeTexImage"))
+    texture = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeTexImage")
+    assert materials.missing_images(material) == [
+        "Material Poster: an image texture node has no image, which shows black"]
+    texture.image = bpy.data.images.new("lost", 4, 4)
+    texture.image.source, texture.image.filepath = "FILE", "//lost.png"
+    assert len(materials.missing_images(material)) == 1 and "lost.png" in materials.missing_images(material)[0]
+    add_quad = bpy.data.objects.new("Quad", bpy.data.meshes.new("Quad"))
+    add_quad.data.from_pydata([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [], [(0, 1, 2, 3)])
+    add_quad.data.materials.append(material)
+    scene.collection.objects.link(add_quad)
+    warnings: list[str] = []
+    read_objects(depsgraph(), None, warnings)
+    assert any("lost.png" in line for line in warnings)
