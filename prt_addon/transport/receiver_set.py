@@ -60,8 +60,8 @@ class ReceiverSet:
         # A direction at angle a from the normal is above a face tilted by b if a + b < 90 degrees: cos a > sin b. The
         # slack covers single precision.
         grazing = np.where(agreement > 0.0, np.sqrt(np.maximum(1.0 - agreement ** 2, 0.0)), 1.0) - 1e-4
-        # Component by component in memory, which is how `above_faces` reads them; the shape says (r, k, 3).
-        faces = np.moveaxis(np.ascontiguousarray(np.moveaxis(faces, 2, 0)), 0, 2)
+        # In memory (r, 3, k), which is how `above_faces` reads them; the shape says (r, k, 3).
+        faces = np.ascontiguousarray(faces.transpose(0, 2, 1)).transpose(0, 2, 1)
         return ReceiverSet(keys[order], tracer.to_tracing_space(origins[order]), normals, faces, weights,
                            grazing.astype(np.float32))
 
@@ -82,9 +82,10 @@ class ReceiverSet:
         (Buddha, 50k vertices, against Cycles: +1.4 %; with it -0.9 %; see benchmarks/against_cycles.py).
         """
         x, y, z = np.atleast_2d(direction).astype(np.float32).T[:, :, None]
-        height = np.take(self.faces[:, :, 0], place, axis=0) * x
-        height += np.take(self.faces[:, :, 1], place, axis=0) * y
-        height += np.take(self.faces[:, :, 2], place, axis=0) * z
+        faces = np.take(self.faces.transpose(0, 2, 1), place, axis=0)  # (n, 3, k), a receiver's faces side by side
+        height = faces[:, 0] * x
+        height += faces[:, 1] * y
+        height += faces[:, 2] * z
         above = (height > 0.0).astype(np.float32)
         return np.vecdot(above, np.take(self.face_weights, place, axis=0))  # small
 
