@@ -86,8 +86,7 @@ def adjacent_faces(points: NDArray[np.float64], triangles: NDArray[np.int32],
 def morton_order(points: NDArray[np.floating]) -> NDArray[np.int64]:
     """Indices that sort points along a Morton curve of 21 bits per axis: neighbours in memory are neighbours in space.
 
-    Rays in one direction from such neighbours visit the same nodes of Embree's tree
-    (twice as fast on the Buddha, see benchmarks/tracing.py).
+    Rays in one direction from such neighbours visit the same nodes of Embree's tree.
     """
     if not len(points):
         return np.zeros(0, np.int64)

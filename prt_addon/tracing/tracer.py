@@ -79,7 +79,7 @@ class Tracer:
 
         At most two items per thread are in flight, so memory stays bounded. Closing the iterator stops the work.
         """
-        # One worker more than cores: while one waits for Python's lock, another keeps its core busy (some 3 % faster).
+        # One worker more than cores: while one waits for Python's lock, another keeps its core busy.
         with ThreadPoolExecutor(self.threads + (self.threads > 1)) as pool:
             pending: list[tuple[Any, Future[Result]]] = []
             try:

@@ -27,7 +27,6 @@ class _Task:
     block: Block
     directions: NDArray[np.float32]
     weighted_basis: NDArray[np.float32]
-    last_of_block: bool
 
 
 def unshadowed_transfer(normals: NDArray[np.float64], order: int) -> NDArray[np.float64]:
@@ -74,7 +73,7 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
         for start in range(0, len(directions), CHUNK):
             chunk = slice(start, start + CHUNK)
             yield _Task(block, np.ascontiguousarray(turned[chunk], np.float32),
-                        np.ascontiguousarray(basis[:, chunk]), start + CHUNK >= len(directions))
+                        np.ascontiguousarray(basis[:, chunk]))
 
 
 def _cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],

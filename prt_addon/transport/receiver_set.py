@@ -79,7 +79,7 @@ class ReceiverSet:
 
         Light from under a face does not reach it, whatever the interpolated normal says: what a render shows around a
         vertex is the mean over its faces of their clipped hemispheres. Without this, rough meshes come out too bright
-        (Buddha, 50k vertices, against Cycles: +1.4 %; with it -0.9 %; see benchmarks/against_cycles.py).
+        (mean of the Buddha's 50k vertices against Cycles: +1.4 %; with it -0.9 %).
         """
         x, y, z = np.atleast_2d(direction).astype(np.float32).T[:, :, None]
         faces = np.take(self.faces.transpose(0, 2, 1), place, axis=0)  # (n, 3, k), a receiver's faces side by side
