@@ -29,7 +29,7 @@ from prt_addon.lighting.environment import load_equirectangular, project, world_
 from prt_addon.lighting.reference_light import ReferenceLight
 from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
 from prt_addon.scene.scene_mesh import SceneMesh
-from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
+from tests.blender.cycles import diffuse_material, environment_world, smooth_environment, use_cycles, vertex_radiance
 
 ALBEDO = (0.7, 0.5, 0.3, 1.0)
 
@@ -43,15 +43,7 @@ def load(name: str) -> bpy.types.Object:
     bpy.context.view_layer.objects.active = thing
     bpy.ops.object.shade_smooth()
     thing.data.materials.clear()
-    material = bpy.data.materials.new("Diffuse")
-    if material.node_tree is None:
-        material.use_nodes = True
-    tree = material.node_tree
-    tree.nodes.clear()
-    diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
-    diffuse.inputs["Color"].default_value = ALBEDO
-    tree.links.new(diffuse.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs[0])
-    thing.data.materials.append(material)
+    thing.data.materials.append(diffuse_material("Diffuse", ALBEDO))
     return thing
 
 

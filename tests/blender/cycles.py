@@ -39,20 +39,21 @@ def add_white_facets(normals: np.ndarray) -> bpy.types.Object:
     corners = (100 * normals + offsets).transpose(1, 0, 2).reshape(-1, 3)
     mesh = bpy.data.meshes.new("Facets")
     mesh.from_pydata(corners.tolist(), [], np.arange(len(corners)).reshape(-1, 3).tolist())
-    mesh.materials.append(_white())
+    mesh.materials.append(diffuse_material("White", (1, 1, 1, 1)))
     facets = bpy.data.objects.new("Facets", mesh)
     bpy.context.scene.collection.objects.link(facets)
     return facets
 
 
-def _white() -> bpy.types.Material:
-    material = bpy.data.materials.new("White")
+def diffuse_material(name: str, colour: tuple[float, float, float, float]) -> bpy.types.Material:
+    """A material of one Diffuse BSDF: the only one whose bake is its colour times irradiance over pi."""
+    material = bpy.data.materials.new(name)
     if material.node_tree is None:
         material.use_nodes = True
     tree = material.node_tree
     tree.nodes.clear()
     output, diffuse = tree.nodes.new("ShaderNodeOutputMaterial"), tree.nodes.new("ShaderNodeBsdfDiffuse")
-    diffuse.inputs["Color"].default_value = (1, 1, 1, 1)
+    diffuse.inputs["Color"].default_value = colour
     tree.links.new(diffuse.outputs[0], output.inputs[0])
     return material
 

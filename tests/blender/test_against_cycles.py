@@ -13,7 +13,7 @@ from prt_addon.blender.read_scene import read_objects
 from prt_addon.lighting.environment import project, world_rotation
 from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
 from prt_addon.scene.scene_mesh import SceneMesh
-from tests.blender.cycles import environment_world, smooth_environment, use_cycles, vertex_radiance
+from tests.blender.cycles import diffuse_material, environment_world, smooth_environment, use_cycles, vertex_radiance
 
 # Cycles' own noise at these samples: two bakes with other seeds differ by sqrt(2) times it (asserted below).
 SAMPLES = 512
@@ -32,15 +32,7 @@ def still_life(scene):
     bpy.ops.mesh.primitive_grid_add(x_subdivisions=20, y_subdivisions=20, size=4.0)
     bpy.ops.object.shade_smooth()
     for thing, colour in zip(bpy.data.objects, ((0.8, 0.25, 0.1, 1), (0.6, 0.7, 0.8, 1)), strict=True):
-        material = bpy.data.materials.new(thing.name)
-        if material.node_tree is None:
-            material.use_nodes = True
-        tree = material.node_tree
-        tree.nodes.clear()
-        diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
-        diffuse.inputs["Color"].default_value = colour
-        tree.links.new(diffuse.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs[0])
-        thing.data.materials.append(material)
+        thing.data.materials.append(diffuse_material(thing.name, colour))
     use_cycles(SAMPLES)
     return scene
 
