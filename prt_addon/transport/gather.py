@@ -19,7 +19,7 @@ from scipy import sparse
 from ..linear_algebra import multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
-from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated, weigh_by_faces
+from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated
 
 CHUNK = 16
 # Receivers of this many generations are traced for what they see; what the last of them sees beyond is counted as lost.
@@ -160,13 +160,17 @@ def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task)
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
     cosines = facing_cosines(task.directions, receivers.normals[place])
-    weigh_by_faces(receivers, place, task.directions, cosines)
-    which, row = np.nonzero(cosines)
+    which, row = np.nonzero(cosines > 0.0)
     rays = len(row)
     hits = tracer.nearest(np.take(receivers.origins[place], row, axis=0), np.take(task.directions, which, axis=0))
     met = np.flatnonzero(hits.triangle >= 0)
     which, row = which[met], row[met]
-    share = cosines[which, row] * task.weights[which, row]
+    share = cosines[which, row]
+    low = np.flatnonzero(share < receivers.grazing[place][row])
+    share[low] *= receivers.above_faces(row[low] + place.start, task.directions[which[low]])
+    share *= task.weights[which, row]
+    seen = np.flatnonzero(share)
+    met, which, row, share = met[seen], which[seen], row[seen], share[seen]
     side = np.where(hits.front[met], 0, len(scene.points))
     corner = scene.triangles[hits.triangle[met]].astype(np.int64) + side[:, None]
     u, v = hits.u[met], hits.v[met]
