@@ -58,7 +58,7 @@ PRESETS: dict[str, BakeSettings] = {
                           encoder="static", compression_error=1e-2, spacing=1.0 / 32.0, error_receivers=32,
                           error_paths=4096),
     "standard": BakeSettings(),
-    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=512, vectors=12,
+    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=512, vectors=16,
                          encoder="adaptive", compression_error=5e-4, spacing=1.0 / 128.0, error_receivers=128,
                          error_paths=16384),
 }
