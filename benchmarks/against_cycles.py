@@ -5,10 +5,11 @@ Cycles bakes. Needs the bpy wheel.
     python benchmarks/against_cycles.py accuracy [--mesh spot.obj] [--samples 64] [--worlds forest,city] [--preset high]
     python benchmarks/against_cycles.py speed [--mesh spot.obj] [--lights 100]
 
-accuracy: relative RMS over (at most --vertices random) vertices and channels, direct and with bounces, at two rotations,
-against what Cycles shows around them (tests/blender/cycles.shown_radiance says why not its bake of the vertices). Cycles
-is baked twice with other seeds; the mean of (ours - a)(ours - b) is the squared error without Cycles' own noise.
-`truncation` is what the order of the lighting leaves out, measured by the bake's own error budget under the same light.
+accuracy: relative RMS over (at most --vertices random) vertices and channels, direct and with bounces, at two
+rotations, against what Cycles shows around them (tests/blender/cycles.shown_radiance says why not its bake of the
+vertices). Cycles is baked twice with other seeds; the mean of (ours - a)(ours - b) is the squared error without Cycles'
+own noise. `truncation` is what the order of the lighting leaves out, measured by the bake's own error budget under the
+same light.
 """
 
 from __future__ import annotations
