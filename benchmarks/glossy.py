@@ -28,7 +28,7 @@ from prt_addon.transport.direct import direct_transfer
 from prt_addon.transport.gather import gather_operator
 from prt_addon.transport.glossy import GlossySurfaces, glossy_transfer, surface_frames
 from prt_addon.transport.hemisphere_visibility import HemisphereVisibility
-from prt_addon.transport.incident_light import DiffuseRadiance, GlossyRadiance, IndirectLight, irradiance_from
+from prt_addon.transport.incident_light import DiffuseRadiance, GlossyRadiance, IndirectLight
 from prt_addon.transport.interreflection import interreflect
 from prt_addon.transport.receiver_set import ReceiverSet
 
@@ -122,10 +122,11 @@ def fill(scene: SceneMesh, arguments: argparse.Namespace, clock: Clock) -> tuple
     visibility = plain.result(receivers.normals)
     tangents = np.cross((0.0, 0.0, 1.0), receivers.normals)
     kernel = lobe_kernel(functions, incident, 2.0 if arguments.rows == 24 else 1.0)
-    surfaces = GlossySurfaces(surface_frames(receivers.normals, tangents), np.zeros(len(receivers), np.int64), (kernel,))
+    frames = surface_frames(receivers.normals, tangents)
+    surfaces = GlossySurfaces(frames, np.zeros(len(receivers), np.int64), (kernel,))
     clock.rows.append(["coefficients, frames, kernel", time.perf_counter() - started])
     if gathered is None:
-        return clock.run("glossy matrices", glossy_transfer(surfaces, order, visibility.visible)), receivers
+        return clock.run("glossy matrices", glossy_transfer(tracer, surfaces, order, visibility.visible)), receivers
     albedo = np.full((len(receivers), 1), ALBEDO, np.float32)
     bounced = clock.run("diffuse bounces", interreflect(gathered.matrix, albedo, direct, 1e-3)).transfer
     record = gathered.hits
@@ -133,11 +134,11 @@ def fill(scene: SceneMesh, arguments: argparse.Namespace, clock: Clock) -> tuple
     source = DiffuseRadiance(record, scene, receivers, bounced * albedo[:, None])
     indirect = IndirectLight(record, source, visibility.rows, visibility.blocked)
     matrices = clock.run("glossy matrices, diffuse bounces in",
-                         glossy_transfer(surfaces, order, visibility.visible, indirect))
+                         glossy_transfer(tracer, surfaces, order, visibility.visible, indirect))
     glossy = GlossyRadiance(record, scene, receivers.key, surfaces.frames, matrices, functions)
     second = IndirectLight(record, glossy, visibility.rows, visibility.blocked)
-    added = clock.run("glossy bounce", glossy_transfer(surfaces, order, None, second))
-    clock.run("glossy bounce to the diffuse row", irradiance_from(record, glossy, visibility.rows))
+    diffuse = np.empty((len(matrices), order ** 2), np.float32)
+    added = clock.run("glossy bounce", glossy_transfer(tracer, surfaces, order, None, second, diffuse=diffuse))
     size = [float(np.sqrt(np.mean(np.square(a, dtype=np.float64)))) for a in (matrices, added)]
     print(f"RMS of the matrices {size[0]:.4g}, of the glossy bounce {size[1]:.4g}")
     return matrices + added, receivers

@@ -18,6 +18,7 @@ from ..basis.directions import tangent_frames
 from ..basis.spherical_harmonics import order_of, rotations
 from ..basis.triple_product import triple_products
 from ..linear_algebra import multiply, small_batched_multiply
+from ..tracing.tracer import Tracer
 from .incident_light import BLOCK, NUMBERS, IndirectLight
 
 
@@ -25,7 +26,7 @@ from .incident_light import BLOCK, NUMBERS, IndirectLight
 class GlossySurfaces:
     """What reflects at g glossy receivers.
 
-    frames: (g, 3, 3) orthonormal, rows tangent, bitangent, normal (`surface_frames`); material: (g,) numbers of kernels;
+    frames: (g, 3, 3) orthonormal, rows tangent, bitangent, normal (`surface_frames`); material: (g,) places in kernels;
     kernels: K of each material, (rows, incident functions, channels), all of one shape.
     """
 
@@ -61,28 +62,34 @@ def surface_frames(normals: NDArray[np.float64], tangents: NDArray[np.float64]) 
     return frames
 
 
-def glossy_transfer(surfaces: GlossySurfaces, light_order: int, visible: NDArray[np.float32] | None,
+def glossy_transfer(tracer: Tracer, surfaces: GlossySurfaces, light_order: int, visible: NDArray[np.float32] | None,
                     indirect: IndirectLight | None = None, out: NDArray[np.float32] | None = None,
-                    ) -> Generator[float, None, NDArray[np.float32]]:
+                    diffuse: NDArray[np.float32] | None = None) -> Generator[float, None, NDArray[np.float32]]:
     """Yield progress, return M (g, rows, light_order^2, channels) float32.
 
     visible: (g, k^2), k = incident order + light_order - 1, from VisibilityCoefficients; None leaves direct light out.
     indirect: light from other surfaces, of light_order^2 columns and 1 or 3 channels; the result has as many channels
     as the kernels or the indirect light, whichever has more. out: an array of the result's shape to write into (it may
-    be a part of a larger one).
+    be a part of a larger one). diffuse: (g, light_order^2 * channels of the indirect light), takes what the indirect
+    light adds to the unit-albedo diffuse row (of use for a glossy bounce: the gather operator knows the diffuse ones).
+    tracer: for its threads; nothing is traced.
     """
+    if visible is None and indirect is None:
+        raise ValueError("glossy_transfer needs the visibility, indirect light, or both")
     columns, channels = light_order ** 2, surfaces.kernels[0].shape[2]
     if indirect is not None:
         channels = max(channels, indirect.source.values // columns)
     shape = (len(surfaces), surfaces.kernels[0].shape[0], columns, channels)
-    if out is None:
-        out = np.empty(shape, np.float32)
-    elif out.shape != shape:
+    out = np.empty(shape, np.float32) if out is None else out
+    if out.shape != shape:
         raise ValueError(f"glossy_transfer: out must be {shape}, not {out.shape}")
-    for part in _blocks(surfaces, columns) if indirect is None else indirect.blocks():
-        incident = _incident(surfaces, light_order, part, visible, indirect)
+
+    def fill(part: slice) -> None:
+        incident = _incident(surfaces, light_order, part, visible, indirect, diffuse)
         _reflect(surfaces, part, _to_surface(surfaces.frames[part], incident), columns, out[part])
-        yield part.stop / max(1, len(surfaces))
+
+    for part, _ in tracer.map_in_order(fill, _blocks(surfaces, columns) if indirect is None else indirect.blocks()):
+        yield part.stop / len(surfaces)
     return out
 
 
@@ -94,21 +101,19 @@ def _blocks(surfaces: GlossySurfaces, columns: int) -> Iterator[slice]:
 
 
 def _incident(surfaces: GlossySurfaces, light_order: int, part: slice, visible: NDArray[np.float32] | None,
-              indirect: IndirectLight | None) -> NDArray[np.float32]:
+              indirect: IndirectLight | None, diffuse: NDArray[np.float32] | None) -> NDArray[np.float32]:
     """T (b, incident functions, columns * channels) in the global frame, direct and indirect light together."""
-    order, columns = surfaces.incident_order, light_order ** 2
-    direct = None
+    shape = (-1, surfaces.incident_order ** 2, light_order ** 2)
     if visible is not None:
-        products = triple_products(order, light_order).astype(np.float32)
-        direct = multiply(visible[part], products).reshape(-1, order * order, columns)
+        products = triple_products(surfaces.incident_order, light_order).astype(np.float32)
+        direct = multiply(visible[part], products).reshape(shape)
     if indirect is None:
-        if direct is None:
-            raise ValueError("glossy_transfer needs the visibility, indirect light, or both")
         return direct
-    incident = indirect.transfer(part)
-    if direct is not None:
-        shape = (*direct.shape, -1)
-        incident.reshape(shape)[...] += direct[..., None]
+    incident, irradiance = indirect.transfer(part)
+    if diffuse is not None:
+        diffuse[part] = irradiance
+    if visible is not None:
+        incident.reshape(*direct.shape, -1)[...] += direct[..., None]
     return incident
 
 
@@ -134,5 +139,6 @@ def _reflect(surfaces: GlossySurfaces, part: slice, incident: NDArray[np.float32
         reflected = [small_batched_multiply(np.ascontiguousarray(kernel[None, :, :, min(c, kernel.shape[2] - 1)]),
                                             np.ascontiguousarray(light[..., min(c, light.shape[3] - 1)]))
                      for c in range(out.shape[3])]
+        place = slice(None) if len(members) == len(material) else members
         for channel, values in enumerate(reflected):
-            out[members, ..., channel] = values
+            out[place, ..., channel] = values

@@ -31,9 +31,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class VisibilityCoefficients:
-    """rows: (g,) places of the receivers in their set; visible: (g, order^2) float32, integrals of what the sky is seen
-    through; blocked: (g, blocked_order^2), of what shows a surface (None where it wasn't asked for). Both leave out what
-    lies under the receiver's faces."""
+    """Integrals of the functions over parts of the receivers' hemispheres, without what lies under their faces.
+
+    rows: (g,) places of the receivers in their set; visible: (g, order^2) float32, over what shows the sky; blocked:
+    (g, blocked_order^2), over what shows a surface (None where it wasn't asked for).
+    """
 
     rows: NDArray[np.int64]
     visible: NDArray[np.float32]

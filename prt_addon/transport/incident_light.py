@@ -91,7 +91,7 @@ class GlossyRadiance:
         place = np.full(2 * len(scene.points), -1, np.int64)
         place[key] = np.arange(len(key))
         self._corners = _Corners(record, scene, place)
-        self._frames, self._functions = frames, np.asarray(functions)
+        self._frames, self._functions = frames.astype(np.float32).reshape(-1, 9), np.asarray(functions)
         self._matrices = matrices.reshape(len(matrices), matrices.shape[1], -1)
         self._order = int(np.sqrt(self._functions.max(initial=0))) + 1
         self.values = self._matrices.shape[2]
@@ -118,13 +118,15 @@ class GlossyRadiance:
     def _view_functions(self, which: NDArray[np.int64], hits: NDArray[np.int64]) -> NDArray[np.float32]:
         """Values (e, rows) of the hemispherical functions towards the receivers."""
         record = self._corners.record
-        view = -record.directions[record.direction[hits]]
-        local = np.sum(self._frames[which] * view[:, None, :], axis=2)
+        x, y, z = -record.directions.T[:, record.direction[hits]]
+        frames = self._frames[which].T
+        local = np.stack([frames[i] * x + frames[i + 1] * y + frames[i + 2] * z for i in (0, 3, 6)], axis=1)
         # A surface may be seen from under its shading normal. The functions are fitted to the upper hemisphere and mean
         # nothing below, so such a view sees what the horizon in its azimuth shows, as when it is drawn.
         local[:, 2] = np.maximum(local[:, 2], 0.0)
         length = np.sqrt(np.sum(local ** 2, axis=1, keepdims=True))
-        local = np.where(length > 1e-6, local / np.maximum(length, 1e-6), (1.0, 0.0, 0.0))
+        local = np.where(length > 1e-6, local / np.maximum(length, np.float32(1e-6)),
+                         np.float32([1.0, 0.0, 0.0]))
         return evaluate(self._order, local)[:, self._functions].astype(np.float32)
 
 
@@ -163,8 +165,9 @@ class IndirectLight:
         functions = self.blocked.shape[1]
         return bounded_blocks(self.record, self.rows, self.source.values, functions * self.source.values)
 
-    def transfer(self, part: slice) -> NDArray[np.float32]:
-        """T (b, n^2, values) of these receivers, in the global frame: sum over hits of w y_i(s) L.
+    def transfer(self, part: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Of these receivers: T (b, n^2, values) in the global frame, sum over hits of w y_i(s) L, and what the same
+        light adds to their unit-albedo diffuse exit radiance (b, values).
 
         The gather's few rays project a function of bounded order times a radiance that varies little: their error on
         the blocked directions alone is known from the many shadow rays, and taken out in proportion to the mean
@@ -174,7 +177,7 @@ class IndirectLight:
         counts = record.first[rows + 1] - record.first[rows]
         result = np.zeros((len(rows), self.blocked.shape[1], self.source.values), np.float32)
         if not counts.any():
-            return result
+            return result, result[:, 0].copy()
         hits = _hits_of(record, rows)
         radiance = self.source.along(hits)
         functions = evaluate(order_of(self.blocked.shape[1]), record.directions).astype(np.float32)
@@ -186,7 +189,7 @@ class IndirectLight:
             sampled = weighted.sum(axis=1)
             mean = sums[:, :1] / sampled[:, :1, None]
             result[group] = sums + (self.blocked[part][group] - sampled)[:, :, None] * mean
-        return result
+        return result, _gathered(record, hits, counts, radiance)
 
 
 def bounded_blocks(record: HitRecord, rows: NDArray[np.int64], values: int, numbers: int) -> Iterator[slice]:
@@ -211,13 +214,19 @@ def _hits_of(record: HitRecord, rows: NDArray[np.int64]) -> NDArray[np.int64]:
 def irradiance_from(record: HitRecord, source: SurfaceRadiance, rows: NDArray[np.int64],
                     ) -> Generator[float, None, NDArray[np.float32]]:
     """Yield progress, return what these of the gather's receivers get of the source as unit-albedo diffuse exit
-    radiance (k, values): the diffuse row's share of a glossy bounce. Their hits must be in the record."""
+    radiance (k, values): a glossy bounce to receivers without glossy rows. Their hits must be in the record."""
     result = np.zeros((len(rows), source.values), np.float32)
     for part in bounded_blocks(record, rows, source.values, source.values):
         hits = _hits_of(record, rows[part])
         counts = record.first[rows[part] + 1] - record.first[rows[part]]
-        first = np.concatenate([[0], np.cumsum(counts)])
-        matrix = sparse.csr_array((record.share[hits], np.arange(len(hits)), first), shape=(len(counts), len(hits)))
-        result[part] = sparse_multiply(matrix, source.along(hits))
+        result[part] = _gathered(record, hits, counts, source.along(hits))
         yield part.stop / len(rows)
     return result
+
+
+def _gathered(record: HitRecord, hits: NDArray[np.int64], counts: NDArray[np.int64], radiance: NDArray[np.float32],
+              ) -> NDArray[np.float32]:
+    """Unit-albedo diffuse exit radiance (b, values) of receivers with so many hits each, from the hits' radiance."""
+    first = np.concatenate([[0], np.cumsum(counts)])
+    matrix = sparse.csr_array((record.share[hits], np.arange(len(hits)), first), shape=(len(counts), len(hits)))
+    return sparse_multiply(matrix, radiance)
