@@ -108,8 +108,8 @@ class GlossyRadiance:
         surfaces, starts, counts = np.unique(which, return_index=True, return_counts=True)
         at_once = max(1, NUMBERS // (values.shape[1] * self.values))
         for group, items, filled in padded_groups(starts, counts, at_once):
-            part = np.where(filled[:, :, None], values[items], np.float32(0.0))
-            radiance[items[filled]] = small_batched_multiply(part, self._matrices[surfaces[group]])[filled]
+            products = small_batched_multiply(values[items], self._matrices[surfaces[group]])
+            radiance[items[filled]] = products[filled]
         back = np.argsort(entry // 3, kind="stable")
         first = np.concatenate([[0], np.cumsum(np.bincount(entry // 3, minlength=len(hits)))])
         ones = np.ones(len(entry), np.float32)

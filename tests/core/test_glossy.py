@@ -414,16 +414,20 @@ def test_white_furnace(count):
     np.testing.assert_allclose(diffuse, np.tile(scale, (len(receivers), 1)), atol=1e-4)
 
 
-def test_a_bright_wall_lights_half_the_hemisphere():
-    wall = make("wall", [(0.01, -1e3, -1e3), (0.01, 1e3, -1e3), (0.01, 1e3, 1e3), (0.01, -1e3, 1e3)],
-                [(0, 2, 1), (0, 3, 2)], target=False)
+@pytest.mark.parametrize("faces", [[(0, 2, 1), (0, 3, 2)], [(0, 1, 2), (0, 2, 3)]], ids=["front", "back"])
+def test_a_bright_wall_lights_half_the_hemisphere(faces):
+    wall = make("wall", [(0.01, -1e3, -1e3), (0.01, 1e3, -1e3), (0.01, 1e3, 1e3), (0.01, -1e3, 1e3)], faces,
+                target=False)
     scene = SceneMesh.assemble([plane(size=1e-3), wall])
     tracer = Tracer(scene.points, scene.triangles, 1)
     wanted = np.ones(2 * len(scene.points), bool)
     gathered = drain(gather_operator(tracer, scene, np.arange(4), *quadrature(512, 4), wanted=wanted))
     seen = traced(scene, 2, 5, 8192, blocked=5, receivers=gathered.receivers)[3]
-    bright = (gathered.receivers.key % len(scene.points) >= 4).astype(np.float32)
-    source = DiffuseRadiance(gathered.hits, scene, gathered.receivers, np.tile(bright[:, None, None], (1, 4, 1)))
+    assert len(gathered.hits.directions) == 512  # two generations, one table
+    facing = gathered.receivers.normals[:, 0] < -0.5  # the wall's receivers on the side that the plane sees
+    assert facing.sum() == 4
+    source = DiffuseRadiance(gathered.hits, scene, gathered.receivers,
+                             np.tile(facing.astype(np.float32)[:, None, None], (1, 4, 1)))
     surfaces = surfaces_of(gathered.receivers, lobe_brdf)
     light = IndirectLight(gathered.hits, source, seen.rows, seen.blocked)
     result = drain(glossy_transfer(tracer, surfaces, 2, None, light))
@@ -434,6 +438,86 @@ def test_a_bright_wall_lights_half_the_hemisphere():
     expected = lobe_brdf(views, directions @ surfaces.frames[here[0]].T) @ lit
     exit_light = np.einsum("vi,rij->rvj", evaluate(5, views), result[here][..., 0])
     assert np.abs(exit_light - expected[:, None]).max() < 1e-2 * expected.max()
+
+
+def test_faces_hide_what_lies_under_them_from_glossy_receivers_too():
+    # A vertex of a smooth-shaded cube sees, as the mean over its faces, two lunes' worth less than its hemisphere.
+    thing = box("thing", (0.45, 0.45, 0.45), (0.55, 0.55, 0.55))
+    outwards = np.sign(thing.positions - 0.5)[thing.triangles] / np.sqrt(3.0)
+    room = SceneMesh.assemble([box(inward=True), replace(thing, corner_normals=outwards.astype(np.float32))], 0.3)
+    cube = room.objects[1].points
+    tracer = Tracer(room.points, room.triangles, 1)
+    wanted = np.ones(2 * len(room.points), bool)
+    gathered = drain(gather_operator(tracer, room, np.arange(len(room.points)), *quadrature(4096, 4), wanted=wanted))
+    seen = traced(room, 2, 5, 4096, blocked=5, receivers=gathered.receivers)[3]
+    corner = np.flatnonzero((gathered.receivers.key >= cube.start) & (gathered.receivers.key < cube.start + 8))
+    expected = 2.0 * (np.pi - np.arccos(1.0 / np.sqrt(3.0)))
+    solid = np.add.reduceat(gathered.hits.solid_angle, gathered.hits.first[:-1])
+    assert len(corner) == 8
+    np.testing.assert_allclose(solid[corner], expected, rtol=0.02)
+    np.testing.assert_allclose(seen.blocked[corner, 0] / Y0, expected, rtol=0.02)
+
+
+def brute_radiance(record, scene, hit, key, frames, matrices):
+    """Exit radiance of a hit from the matrices of its corners, in angles."""
+    view = -record.directions[record.direction[hit]].astype(float)
+    u, v = float(record.u[hit]), float(record.v[hit])
+    total = np.zeros(matrices.shape[2:])
+    for point, weight in zip(scene.triangles[record.triangle[hit]], (1 - u - v, u, v), strict=True):
+        place = np.flatnonzero(key == point + (0 if record.front[hit] else len(scene.points)))
+        if len(place):
+            x, y, z = frames[place[0]] @ view
+            height = max(z, 0.0)
+            azimuth, radius = np.arctan2(y, x), np.sqrt(1 - height**2)
+            above = np.array([[radius * np.cos(azimuth), radius * np.sin(azimuth), height]])
+            total += weight * np.tensordot(evaluate(5, above)[0, 1:], matrices[place[0]], 1)
+    return total
+
+
+def test_sums_over_hits_equal_brute_force():
+    room = SceneMesh.assemble([box(inward=True), sphere("thing", 0.2, (0.5, 0.5, 0.5), 1)], 0.4)
+    tracer = Tracer(room.points, room.triangles, 1)
+    wanted = np.ones(2 * len(room.points), bool)
+    gathered = drain(gather_operator(tracer, room, np.arange(len(room.points)), *quadrature(96, 4), wanted=wanted))
+    record, receivers, rng = gathered.hits, gathered.receivers, np.random.default_rng(4)
+    some = np.sort(rng.permutation(len(receivers))[:len(receivers) // 2])  # the other half has no glossy rows
+    frames = surface_frames(receivers.normals[some], random_directions(len(some), 2))
+    matrices = rng.normal(size=(len(some), 24, 4, 3)).astype(np.float32)
+    source = GlossyRadiance(record, room, receivers.key[some], frames, matrices, ALL[1:])
+    hits = rng.permutation(len(record.triangle))[:400]
+    brute = np.array([brute_radiance(record, room, h, receivers.key[some], frames, matrices) for h in hits])
+    np.testing.assert_allclose(source.along(hits), brute.reshape(400, -1), atol=2e-4)
+    owner = np.repeat(np.arange(len(receivers)), np.diff(record.first))
+    # The control variate: the blocked coefficients that the hits themselves sample leave the plain sum.
+    basis = evaluate(3, record.directions[record.direction]) * record.solid_angle[:, None]
+    sampled = np.zeros((len(receivers), 9))
+    np.add.at(sampled, owner, basis)
+    rows = np.arange(len(receivers))[::2]
+    light = IndirectLight(record, source, rows, sampled[rows].astype(np.float32))
+    transfer = np.concatenate([light.transfer(part)[0] for part in light.blocks()])
+    expected = np.zeros((len(receivers), 9, 12))
+    np.add.at(expected, owner, basis[:, :, None] * source.along(np.arange(len(owner)))[:, None, :])
+    np.testing.assert_allclose(transfer, expected[rows], atol=2e-4)
+
+
+def test_coloured_indirect_light_keeps_its_channels():
+    tracer, room, gathered, seen = room_parts()
+    radiance = np.random.default_rng(7).random((len(gathered.receivers), 4, 3)).astype(np.float32)
+    surfaces = surfaces_of(gathered.receivers, stretched_brdf)
+
+    def result(values, material):
+        source = DiffuseRadiance(gathered.hits, room, gathered.receivers, values)
+        light = IndirectLight(gathered.hits, source, seen.rows, seen.blocked)
+        return drain(glossy_transfer(tracer, material, 2, seen.visible, light))
+
+    together = result(radiance, surfaces)
+    assert together.shape[3] == 3
+    for channel in range(3):
+        alone = result(np.ascontiguousarray(radiance[:, :, channel:channel + 1]), surfaces)
+        np.testing.assert_allclose(together[..., channel], alone[..., 0], atol=1e-4 * np.abs(alone).max())
+    colours = np.array([1.0, 0.5, 0.0])
+    coloured = replace(surfaces, kernels=(surfaces.kernels[0] * colours,))
+    np.testing.assert_allclose(result(radiance, coloured), together * colours, atol=1e-4 * np.abs(together).max())
 
 
 def test_a_glossy_floor_is_seen_from_above_as_its_matrices_say():
