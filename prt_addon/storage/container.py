@@ -38,6 +38,7 @@ class BakedTransfer:
     positions: NDArray[np.float32]
     normals: NDArray[np.float32]
     triangles: NDArray[np.int32]
+    tangents: NDArray[np.float32] | None = None
 
     @property
     def columns(self) -> int:
