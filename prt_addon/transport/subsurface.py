@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +42,6 @@ GROUPS_AT_ONCE = 256
 ROWS_IN_FULL = 8
 # Row sums are added in single precision.
 ROUNDING = 1e-5
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -158,23 +155,24 @@ class _Body:
         matrices = [csr_array((values, links.indices, links.indptr), shape=shape) for values in links.values]
         return {pair: sparse_multiply(matrices[pair[0]], flux) for pair, flux in self.light.items()}
 
-    def sums(self, rows: NDArray[np.int64], products: dict[tuple[int, int], NDArray[np.float32]],
-             ) -> NDArray[np.float64]:
+    def sums(self, links: Links, products: dict[tuple[int, int], NDArray[np.float32]]) -> NDArray[np.float64]:
         """Row sums (rows, k): what leaves each place under uniform unit irradiance, before its own factor."""
         gathered = {kernel: product[:, -1] for (kernel, _), product in products.items()}
-        squared = self.places.tree.areas[rows] / np.pi
-        return np.stack([gathered[kernel] + self.scale[rows, kernel] * disc_integral(poles, squared)
+        own = links.own * self.scale[links.rows]
+        squared = self.places.tree.areas[links.rows] / np.pi
+        return np.stack([gathered[kernel] + own[:, kernel] * disc_integral(poles, squared)
                          for kernel, poles in enumerate(self.places.kernels)], axis=1)
 
-    def exit(self, receivers: NDArray[np.int64], row: NDArray[np.int64], factors: NDArray[np.float64],
-             products: dict[tuple[int, int], NDArray[np.float32]]) -> NDArray[np.float32]:
-        """B (m, columns, 3) of some receivers. row (m,): into the products; factors (p, k): of the places."""
+    def exit(self, receivers: NDArray[np.int64], row: NDArray[np.int64], own: NDArray[np.float64],
+             factors: NDArray[np.float64], products: dict[tuple[int, int], NDArray[np.float32]]) -> NDArray[np.float32]:
+        """B (m, columns, 3) of some receivers. row (m,): into the products and `own` of Links; factors (p, k): of
+        the places."""
         result = np.empty((len(receivers), self.irradiance.shape[1], 3), np.float32)
         place = self.places.of[receivers]
         for channel in range(3):
             kernel, source = pair = self.pair(channel)
-            ring, area = self.ring[receivers, kernel], self.places.areas[receivers]
-            alone = self.scale[place, kernel] * (self.own[receivers, kernel] - ring * area)
+            ring, area = own[row, kernel] * self.ring[receivers, kernel], self.places.areas[receivers]
+            alone = self.scale[place, kernel] * (own[row, kernel] * self.own[receivers, kernel] - ring * area)
             value = products[pair][row, :-1]
             value += _column(ring) * self.light[pair][place, :-1]
             value += _column(alone) * self.irradiance[receivers, :, source]
@@ -217,18 +215,18 @@ def _gathered(body: _Body, tolerance: float, threads: int, progress: float) -> G
 
     for links, products in _in_order(gather, blocks, threads):
         rows = links.rows
-        sums[rows] = body.sums(rows, products)
+        sums[rows] = body.sums(links, products)
         factors[rows] = np.minimum(body.scale[rows], 1.0 / np.maximum(sums[rows], 1.0))
         receivers = members[first[rows[0]]:first[rows[-1] + 1]]
-        transfer[receivers] = body.exit(receivers, places.of[receivers] - rows[0], factors, products)
+        transfer[receivers] = body.exit(receivers, places.of[receivers] - rows[0], links.own, factors, products)
         count += len(links.indices)
         bound = max(bound, float(links.bound.max()))
         yield progress + 0.5 * (rows[-1] + 1) / len(tree.points)
     return _Gathered(transfer, factors, sums, sums * factors, count / len(tree.points), bound)
 
 
-def _in_order(work: Callable[[NDArray[np.int64]], Result], items: Iterable[NDArray[np.int64]], threads: int,
-              ) -> Iterator[Result]:
+def _in_order[Result](work: Callable[[NDArray[np.int64]], Result], items: Iterable[NDArray[np.int64]], threads: int,
+                      ) -> Iterator[Result]:
     """Results of `work` in the items' order, at most two per thread in flight."""
     if threads <= 1:
         yield from map(work, items)
@@ -254,8 +252,9 @@ def _measured_error(body: _Body, found: _Gathered, checked: int, seed: int) -> t
     squared = reference = worst = brightest = 0.0
     for start in range(0, len(receivers), ROWS_IN_FULL):
         part = receivers[start:start + ROWS_IN_FULL]
-        products = body.products(fully_linked(body.places, body.places.of[part]))
-        full = body.exit(part, np.arange(len(part)), found.factors, products).astype(np.float64)
+        links = fully_linked(body.places, body.places.of[part])
+        products = body.products(links)
+        full = body.exit(part, np.arange(len(part)), links.own, found.factors, products).astype(np.float64)
         off = np.abs(found.transfer[part] - full)
         squared += float(np.sum(off**2))
         reference += float(np.sum(full**2))

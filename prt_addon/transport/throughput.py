@@ -2,9 +2,11 @@
 """Throughput factors of subsurface light as rows of a sparse matrix (Carr et al. 2003, eq. 10): which nodes of the
 tree a place takes (Jensen & Buhler 2002), and the mean of R_d over each node.
 
-Near field. A sample stands for a disc of its area. Near ones are integrated over their disc, and none gives more than
-the closed form allows outside the receiver's own disc, so R_d's peak makes no energy where samples lie closer than
-their discs or further apart than the mean free path.
+Near field. A sample stands for a disc of its area. Near ones are integrated over their disc. Discs overlap and leave
+gaps where cells meet without, and R_d has a peak, so near sums come out too bright by percents where the mean free path
+is a third of the spacing, and by any factor where samples crowd. But surface without overlaps gives at most what a
+round disc of the same area gives (R_d falls with distance), in closed form: the near samples that face as the place
+does, itself among them, are scaled down to that, and those that face the other way (the back of a sheet) apart.
 """
 
 from __future__ import annotations
@@ -35,14 +37,15 @@ class Places:
     """Distinct positions of receivers, lengths in units of the object's size.
 
     of: (r,) the place of each receiver, in the tree's order; areas: (r,) of the receivers; tree: over the places;
-    tangents: (p, 2, 3) of their discs; kernels: the distinct ones among the channels; kernel_of: the kernel of each
-    of the 3 channels; where (3, c), sizes (c,): the matrix's columns, that is samples and then nodes, and their areas.
+    frames: (p, 3, 3) tangent, bitangent and normal of their discs; kernels: the distinct ones among the channels;
+    kernel_of: the kernel of each of the 3 channels; where (3, c), sizes (c,): the matrix's columns, that is samples
+    and then nodes, and their areas.
     """
 
     of: NDArray[np.int64]
     areas: NDArray[np.float64]
     tree: SampleTree
-    tangents: NDArray[np.float64]
+    frames: NDArray[np.float64]
     kernels: tuple[Poles, ...]
     kernel_of: tuple[int, ...]
     where: NDArray[np.float64]
@@ -70,7 +73,7 @@ class Places:
         poles = [medium.poles(channel, size) for channel in range(3)]
         kernels = tuple(dict.fromkeys(poles))
         where = np.ascontiguousarray(np.concatenate([tree.points, tree.centre]).T)
-        return Places(position[place], areas / size**2, tree, tangent_frames(towards)[tree.order, :2], kernels,
+        return Places(position[place], areas / size**2, tree, tangent_frames(towards)[tree.order], kernels,
                       tuple(kernels.index(p) for p in poles), where, tree.summed(tree.areas))
 
 
@@ -78,13 +81,15 @@ class Places:
 class Links:
     """A block of rows: a CSR pattern over samples and nodes, and per kernel the mean of R_d over each.
 
-    A place has no link to itself. bound: (rows,) no row's sum with values of at most 1 is further off than this.
+    A place has no link to itself. own: (rows, k) what is left of its own disc, see above. bound: (rows,) no row's sum
+    with values of at most 1 is further off than this.
     """
 
     rows: NDArray[np.int64]
     indptr: NDArray[np.int64]
     indices: NDArray[np.int32]
     values: list[NDArray[np.float32]]
+    own: NDArray[np.float64]
     bound: NDArray[np.float64]
 
 
@@ -100,7 +105,7 @@ def linked(places: Places, groups: NDArray[np.int64], tolerance: float) -> Links
     indptr = np.concatenate([[0], np.cumsum(links[owner])])
     shift = (np.cumsum(links) - links)[owner] - indptr[:-1]
     indices = column[np.arange(indptr[-1]) + np.repeat(shift, links[owner])]
-    return Links(rows, indptr, indices, _values(places, rows, indptr, indices), bound[owner])
+    return Links(rows, indptr, indices, *_values(places, rows, indptr, indices), bound[owner])
 
 
 def fully_linked(places: Places, rows: NDArray[np.int64]) -> Links:
@@ -108,7 +113,7 @@ def fully_linked(places: Places, rows: NDArray[np.int64]) -> Links:
     number = len(places.tree.points)
     indptr = np.arange(len(rows) + 1) * number
     indices = np.tile(np.arange(number, dtype=np.int32), len(rows))
-    return Links(rows, indptr, indices, _values(places, rows, indptr, indices), np.zeros(len(rows)))
+    return Links(rows, indptr, indices, *_values(places, rows, indptr, indices), np.zeros(len(rows)))
 
 
 def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
@@ -159,8 +164,8 @@ def _errors(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], t
 
 
 def _values(places: Places, rows: NDArray[np.int64], indptr: NDArray[np.int64], indices: NDArray[np.int32],
-            ) -> list[NDArray[np.float32]]:
-    """The mean of R_d over every column of some rows, per kernel; 0 for a place's own column."""
+            ) -> tuple[list[NDArray[np.float32]], NDArray[np.float64]]:
+    """The mean of R_d over every column of some rows, per kernel, 0 for a place's own column; and `own` of Links."""
     per_row = np.diff(indptr)
     squared = np.zeros(len(indices))
     for axis in range(3):
@@ -169,52 +174,72 @@ def _values(places: Places, rows: NDArray[np.int64], indptr: NDArray[np.int64], 
         apart *= apart
         squared += apart
     squared = squared.astype(np.float32)
-    row = np.repeat(rows.astype(np.int32), per_row)
-    near = _near(places, row, indices, squared)
-    itself = np.flatnonzero(row == indices)
-    discs = _disc_distances(places, row[near], indices[near])
-    result = []
-    for poles in places.kernels:
-        values = diffuse_reflectance(poles, squared)
-        values[near] = _mean_over_discs(places, poles, row[near], indices[near], discs)
-        values[itself] = 0.0
-        result.append(values)
-    return result
+    row = np.repeat(np.arange(len(rows), dtype=np.int32), per_row)
+    itself = np.flatnonzero(rows[row] == indices)
+    squared[itself] = 1e30  # not near
+    near = _near(places, indices, squared)
+    field = _NearField.of(places, rows, row[near], indices[near])
+    values, own = [], np.empty((len(rows), len(places.kernels)))
+    for kernel, poles in enumerate(places.kernels):
+        value = diffuse_reflectance(poles, squared)
+        value[itself] = 0.0
+        value[near], own[:, kernel] = field.values(poles)
+        values.append(value)
+    return values, own
 
 
-def _near(places: Places, row: NDArray[np.int32], indices: NDArray[np.int32], squared: NDArray[np.float32],
-          ) -> NDArray[np.int64]:
+def _near(places: Places, indices: NDArray[np.int32], squared: NDArray[np.float32]) -> NDArray[np.int64]:
     """The pairs whose disc is large against its distance, see NEAR."""
     number = len(places.tree.points)
     # Nodes have no disc, and a place without an area gives nothing.
     limit = np.zeros(len(places.sizes), np.float32)
     limit[:number] = places.tree.areas / (np.pi * NEAR * NEAR)
     shallowest = min(poles.real for poles in places.kernels)
-    return np.flatnonzero((np.take(limit, indices) > squared + np.float32(shallowest**2)) & (row != indices))
+    return np.flatnonzero(np.take(limit, indices) > squared + np.float32(shallowest**2))
 
 
-def _disc_distances(places: Places, row: NDArray[np.int32], column: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Squared distances (7, n) from places to the rule's points on other places' discs, the middle first."""
-    apart = places.tree.points[column] - places.tree.points[row]
-    radius = RULE_RADIUS * np.sqrt(places.tree.areas[column] / np.pi)
-    along = [radius * np.sum(apart * places.tangents[column, axis], axis=1) for axis in range(2)]
-    middle = np.sum(apart * apart, axis=1)
-    result = np.empty((7, len(row)), np.float32)
-    result[0] = middle
-    for index in range(6):
-        angle = np.pi / 3.0 * index
-        # Rounding must not make a squared distance negative.
-        result[index + 1] = np.maximum(
-            middle + radius**2 + 2.0 * (np.cos(angle) * along[0] + np.sin(angle) * along[1]), 0.0)
-    return result
+@dataclass(frozen=True)
+class _NearField:
+    """n near pairs of some rows. row: (n,); area, facing: (n,) of the other disc; own: (rows,) areas of the places;
+    squared: (7, n) float32 distances from the place to the rule's points on the other disc, the middle first."""
 
+    row: NDArray[np.int32]
+    area: NDArray[np.float64]
+    facing: NDArray[np.bool_]
+    own: NDArray[np.float64]
+    squared: NDArray[np.float32]
 
-def _mean_over_discs(places: Places, poles: Poles, row: NDArray[np.int32], column: NDArray[np.int32],
-                     squared: NDArray[np.float32]) -> NDArray[np.float64]:
-    """The mean of R_d over near discs (n,), but no more than over the ring of the same area that closes around the
-    receiver's own disc: nothing that does not overlap it can lie nearer, and R_d falls with distance."""
-    values = diffuse_reflectance(poles, squared)
-    mean = RULE_MIDDLE * values[0] + RULE_RING * values[1:].sum(axis=0, dtype=np.float64)
-    own, other = places.tree.areas[row], places.tree.areas[column]
-    ring = disc_integral(poles, (own + other) / np.pi) - disc_integral(poles, own / np.pi)
-    return np.minimum(mean, ring / other)
+    @staticmethod
+    def of(places: Places, rows: NDArray[np.int64], row: NDArray[np.int32], column: NDArray[np.int32]) -> _NearField:
+        tree, place = places.tree, rows[row]
+        apart = tree.points[column] - tree.points[place]
+        frames = places.frames[column]
+        facing = np.sum(frames[:, 2] * places.frames[place, 2], axis=1) >= 0.0
+        radius = RULE_RADIUS * np.sqrt(tree.areas[column] / np.pi)
+        along = [2.0 * radius * np.sum(apart * frames[:, axis], axis=1) for axis in range(2)]
+        squared = np.empty((7, len(row)), np.float32)
+        squared[0] = middle = np.sum(apart * apart, axis=1)
+        for index in range(6):
+            angle = np.pi / 3.0 * index
+            # Rounding must not make a squared distance negative.
+            squared[index + 1] = np.maximum(
+                middle + radius**2 + np.cos(angle) * along[0] + np.sin(angle) * along[1], 0.0)
+        return _NearField(row, tree.areas[column], facing, tree.areas[rows], squared)
+
+    def values(self, poles: Poles) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The mean of R_d over each disc (n,), and what is left of the places' own discs (rows,)."""
+        at = diffuse_reflectance(poles, self.squared)
+        mean = RULE_MIDDLE * at[0] + RULE_RING * at[1:].sum(axis=0, dtype=np.float64)
+        # One disc alone gives at most what it would around the place.
+        mean = np.minimum(mean, disc_integral(poles, self.area / np.pi) / self.area)
+        front = self._left(poles, mean, self.facing, self.own)
+        back = self._left(poles, mean, ~self.facing, np.zeros_like(self.own))
+        return mean * np.where(self.facing, front[self.row], back[self.row]), front
+
+    def _left(self, poles: Poles, mean: NDArray[np.float64], chosen: NDArray[np.bool_], own: NDArray[np.float64],
+              ) -> NDArray[np.float64]:
+        """The factor (rows,), at most 1, that brings the chosen discs and the own one down to a round disc's light."""
+        row, area = self.row[chosen], self.area[chosen]
+        total = np.bincount(row, area * mean[chosen], len(own)) + disc_integral(poles, own / np.pi)
+        largest = disc_integral(poles, (np.bincount(row, area, len(own)) + own) / np.pi)
+        return np.divide(largest, total, out=np.ones_like(own), where=total > largest)
