@@ -133,37 +133,74 @@ class Poles(NamedTuple):
 
 def diffuse_reflectance(poles: Poles, squared: NDArray[np.floating]) -> NDArray[np.floating]:
     """R_d at squared distances r^2, in their precision."""
-    alpha, real, virtual, decay = poles
+    return _sum_of_poles(poles, squared, None, None)
+
+
+def mean_reflectance(poles: Poles, squared: NDArray[np.floating], spread: NDArray[np.floating],
+                     along: NDArray[np.floating]) -> NDArray[np.floating]:
+    """R_d's mean over surface whose centre is at squared distance r^2, to second order, and at least 0.
+
+    spread: trace of the surface's covariance C about its centre; along: r^T C r. With f(r^2) = R_d, the mean is
+    f + f' tr C + 2 f'' r^T C r (half the covariance against the Hessian).
+    """
+    return np.maximum(_sum_of_poles(poles, squared, spread, along), 0.0)
+
+
+def _sum_of_poles(poles: Poles, squared: NDArray[np.floating], spread: NDArray[np.floating] | None,
+                  along: NDArray[np.floating] | None) -> NDArray[np.floating]:
+    """Per pole, with q = sigma_tr d: c e^-q / d^3 ((1 + q) - (3 + 3q + q^2) tr C / 2d^2
+    + (15 + 15q + 6q^2 + q^3) r^T C r / 2d^4), c = alpha' z / 4pi."""
+    kind = squared.dtype.type
     result = np.zeros_like(squared)
-    for depth in (real, virtual):
-        distance = squared + squared.dtype.type(depth * depth)
-        np.sqrt(distance, out=distance)
-        reach = distance * squared.dtype.type(decay)
-        term = np.exp(-reach)
-        reach += 1.0
-        term *= reach
-        term *= squared.dtype.type(alpha * depth / (4.0 * np.pi))
-        # Three divisions: d^3 of a shallow pole leaves the range of single precision where the quotient does not.
+    for depth in (poles.real, poles.virtual):
+        inverse = squared + kind(depth * depth)
+        np.sqrt(inverse, out=inverse)
+        reach = inverse * kind(poles.decay)
+        np.divide(kind(1.0), inverse, out=inverse)
+        term = reach + kind(1.0)
+        if spread is not None:
+            # In nested form: 15 + 15q + 6q^2 + q^3 = 5 (3 + 3q + q^2) + q^2 + q^3.
+            square = reach * reach
+            first = kind(3.0) * term
+            first += square
+            second = kind(5.0) * first
+            second += square * term
+            second *= along
+            second *= inverse
+            second *= inverse
+            first *= spread
+            second -= first
+            second *= inverse
+            second *= inverse
+            second *= kind(0.5)
+            term += second
+        np.negative(reach, out=reach)
+        term *= np.exp(reach, out=reach)
+        term *= kind(poles.alpha * depth / (4.0 * np.pi))
+        # Not d^3 at once: of a shallow pole it leaves the range of single precision where the quotient does not.
         for _ in range(3):
-            term /= distance
+            term *= inverse
         result += term
     return result
 
 
-def steepest(poles: Poles, nearest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """An upper bound of |dR_d/dr| at all r >= nearest (double precision).
+def slope_and_curvature(poles: Poles, nearest: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Upper bounds of |dR_d/dr| and of the Hessian's norm at all r >= nearest (double precision).
 
-    Per pole |dR_d/dr| = alpha' z / 4pi . r / d^5 . (3 + 3s + s^2) exp(-s), s = sigma_tr d. The last factor falls with
-    r, r / d^5 rises to r = z/2 and falls from there.
+    Per pole, q = sigma_tr d: |dR_d/dr| = c r/d^5 (3 + 3q + q^2) e^-q, where the last factors fall with r while r/d^5
+    rises to r = z/2 and falls from there; the Hessian's eigenvalues lie within c/d^5 (15 + 15q + 6q^2 + q^3) e^-q,
+    which falls with r.
     """
-    alpha, real, virtual, decay = poles
-    result = np.zeros_like(nearest)
-    for depth in (real, virtual):
-        reach = decay * np.sqrt(nearest * nearest + depth * depth)
-        falling = (3.0 + 3.0 * reach + reach * reach) * np.exp(-reach)
+    slope, curvature = np.zeros((2, *nearest.shape))
+    for depth in (poles.real, poles.virtual):
+        squared = nearest * nearest + depth * depth
+        q = poles.decay * np.sqrt(squared)
+        factor = poles.alpha * depth / (4.0 * np.pi) * np.exp(-q)
+        first = 3.0 + 3.0 * q + q * q
         top = np.maximum(nearest, 0.5 * depth)
-        result += alpha * depth / (4.0 * np.pi) * top * (top * top + depth * depth) ** -2.5 * falling
-    return result
+        slope += factor * first * top * (top * top + depth * depth) ** -2.5
+        curvature += factor * (5.0 * first + q * q * (1.0 + q)) * squared**-2.5
+    return slope, curvature
 
 
 def disc_integral(poles: Poles, squared_radius: ArrayLike) -> NDArray[np.float64]:

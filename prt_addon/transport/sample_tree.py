@@ -12,14 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+# Which coordinates the six numbers of a symmetric matrix belong to.
+ROWS, COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+
 
 @dataclass(frozen=True)
 class SampleTree:
     """order: (n,) the samples in the tree's order; points (n, 3), areas (n,): in that order; depth: levels below the
     root, at which every node has at most one sample. Per node: first, count: its run of samples; centre (m, 3):
     area-weighted; reach: largest distance of a sample from the centre; extent: the same to the rim of the samples'
-    discs; spread: root mean square distance of the
-    surface from the centre, the samples' own discs included. Nodes of the last level have only first and count."""
+    discs; covariance: (m, 6) of the surface about its
+    centre, the discs included, as xx yy zz xy xz yz. Nodes of the last level have only first and count."""
 
     order: NDArray[np.int64]
     points: NDArray[np.float64]
@@ -30,11 +33,11 @@ class SampleTree:
     centre: NDArray[np.float64]
     reach: NDArray[np.float64]
     extent: NDArray[np.float64]
-    spread: NDArray[np.float64]
+    covariance: NDArray[np.float64]
 
     @staticmethod
-    def over(points: NDArray[np.float64], areas: NDArray[np.float64]) -> SampleTree:
-        """The tree over n >= 1 points (n, 3) with areas (n,) >= 0."""
+    def over(points: NDArray[np.float64], areas: NDArray[np.float64], discs: NDArray[np.float64]) -> SampleTree:
+        """The tree over n >= 1 points (n, 3) with areas (n,) >= 0; discs: (n, 6) covariances of the samples' discs."""
         number = len(points)
         depth = max(0, number - 1).bit_length()
         order = np.arange(number)
@@ -48,8 +51,8 @@ class SampleTree:
         bounds = [_bounds(number, level) for level in range(depth + 1)]
         first = np.concatenate([b[:-1] for b in bounds])
         count = np.concatenate([np.diff(b) for b in bounds])
-        figures = [_figures(points[order], areas[order], b) for b in bounds[:depth]]
-        together = (np.concatenate([np.zeros((0, 3) if i == 0 else 0), *(f[i] for f in figures)]) for i in range(4))
+        figures = [_figures(points[order], areas[order], discs[order], b) for b in bounds[:depth]]
+        together = (np.concatenate([np.zeros(_NONE[i]), *(f[i] for f in figures)]) for i in range(4))
         return SampleTree(order, points[order], areas[order], depth, first, count, *together)
 
     def level(self, largest: int) -> NDArray[np.int64]:
@@ -75,22 +78,26 @@ class SampleTree:
         return result
 
 
+# Shapes of the figures of no node.
+_NONE = ((0, 3), (0,), (0,), (0, 6))
+
+
 def _bounds(number: int, level: int) -> NDArray[np.int64]:
     """Where the runs of a level begin and end: (2^level + 1,). Those of the next level subdivide them."""
     return (np.arange(2**level + 1) * number) >> level
 
 
-def _figures(points: NDArray[np.float64], areas: NDArray[np.float64], bounds: NDArray[np.int64],
-             ) -> tuple[NDArray[np.float64], ...]:
-    """Centre, reach, extent and spread of the nodes of a level."""
+def _figures(points: NDArray[np.float64], areas: NDArray[np.float64], discs: NDArray[np.float64],
+             bounds: NDArray[np.int64]) -> tuple[NDArray[np.float64], ...]:
+    """Centre, reach, extent and covariance of the nodes of a level."""
     start, size = bounds[:-1], np.diff(bounds)
     # A node whose samples all have no area still needs a centre.
-    weights = np.maximum(areas, 1e-12 * areas.mean() if areas.any() else 1.0)
+    weights = np.maximum(areas, 1e-12 * areas.mean() if areas.any() else 1.0)[:, None]
     total = np.add.reduceat(weights, start)
-    centre = np.add.reduceat(weights[:, None] * points, start) / total[:, None]
-    squared = np.sum((points - np.repeat(centre, size, axis=0)) ** 2, axis=1)
-    reach = np.sqrt(np.maximum.reduceat(squared, start))
-    extent = np.maximum.reduceat(np.sqrt(squared) + np.sqrt(areas / np.pi), start)
-    # A disc of area a has the mean square radius a / 2pi.
-    spread = np.sqrt(np.add.reduceat(weights * (squared + areas / (2.0 * np.pi)), start) / total)
-    return centre, reach, extent, spread
+    centre = np.add.reduceat(weights * points, start) / total
+    apart = points - np.repeat(centre, size, axis=0)
+    distance = np.sqrt(np.sum(apart * apart, axis=1))
+    reach = np.maximum.reduceat(distance, start)
+    extent = np.maximum.reduceat(distance + np.sqrt(areas / np.pi), start)
+    covariance = np.add.reduceat(weights * (apart[:, ROWS] * apart[:, COLUMNS] + discs), start) / total
+    return centre, reach, extent, covariance

@@ -37,8 +37,8 @@ from .throughput import GROUP, Links, Places, fully_linked, linked
 # Error that the hierarchy may make, relative to the half-space's R, if light changed its sign from sample to sample;
 # the error measured against the full sum is some hundred times less (benchmarks/subsurface.py).
 TOLERANCE = 1.0
-# Groups of places linked at once (about a million links), and rows of full sums.
-GROUPS_AT_ONCE = 256
+# Groups of places linked at once, and rows of full sums: some 1e5 links, whose numbers stay in the cache.
+GROUPS_AT_ONCE = 128
 ROWS_IN_FULL = 8
 # Row sums are added in single precision.
 ROUNDING = 1e-5
@@ -155,11 +155,29 @@ class _Body:
         matrices = [csr_array((values, links.indices, links.indptr), shape=shape) for values in links.values]
         return {pair: sparse_multiply(matrices[pair[0]], flux) for pair, flux in self.light.items()}
 
-    def sums(self, links: Links, products: dict[tuple[int, int], NDArray[np.float32]]) -> NDArray[np.float64]:
+    def gathered(self, groups: NDArray[np.int64], tolerance: float) -> _Rows:
+        """What the places of adjacent groups gather."""
+        tree = self.places.tree
+        first, last = tree.first[groups[0]], tree.first[groups[-1]] + tree.count[groups[-1]]
+        turns, bound = linked(self.places, groups, tolerance)
+        own = np.empty((last - first, len(self.places.kernels)))
+        products = {pair: np.empty((last - first, flux.shape[1]), np.float32) for pair, flux in self.light.items()}
+        count = 0
+        for turn, links in enumerate(turns):
+            there = tree.count[groups] > turn
+            row = links.rows[there] - first
+            own[row] = links.own[there]
+            for pair, product in self.products(links).items():
+                products[pair][row] = product[there]
+            count += int(np.diff(links.indptr)[there].sum())
+        return _Rows(np.arange(first, last), own, products, count, float(bound.max()))
+
+    def sums(self, rows: NDArray[np.int64], own: NDArray[np.float64],
+             products: dict[tuple[int, int], NDArray[np.float32]]) -> NDArray[np.float64]:
         """Row sums (rows, k): what leaves each place under uniform unit irradiance, before its own factor."""
         gathered = {kernel: product[:, -1] for (kernel, _), product in products.items()}
-        own = links.own * self.scale[links.rows]
-        squared = self.places.tree.areas[links.rows] / np.pi
+        own = own * self.scale[rows]
+        squared = self.places.tree.areas[rows] / np.pi
         return np.stack([gathered[kernel] + own[:, kernel] * disc_integral(poles, squared)
                          for kernel, poles in enumerate(self.places.kernels)], axis=1)
 
@@ -179,6 +197,17 @@ class _Body:
             value *= _column(factors[place, kernel])
             result[:, :, channel] = value
         return result
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """What a block of places gathers: products, `own` of Links, number of links, largest error bound."""
+
+    rows: NDArray[np.int64]
+    own: NDArray[np.float64]
+    products: dict[tuple[int, int], NDArray[np.float32]]
+    links: int
+    bound: float
 
 
 def _column(values: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -209,18 +238,14 @@ def _gathered(body: _Body, tolerance: float, threads: int, progress: float) -> G
     first = np.searchsorted(places.of[members], np.arange(len(tree.points) + 1))
     count, bound = 0, 0.0
 
-    def gather(block: NDArray[np.int64]) -> tuple[Links, dict[tuple[int, int], NDArray[np.float32]]]:
-        links = linked(places, block, tolerance)
-        return links, body.products(links)
-
-    for links, products in _in_order(gather, blocks, threads):
-        rows = links.rows
-        sums[rows] = body.sums(links, products)
+    for block in _in_order(lambda groups: body.gathered(groups, tolerance), blocks, threads):
+        rows = block.rows
+        sums[rows] = body.sums(rows, block.own, block.products)
         factors[rows] = np.minimum(body.scale[rows], 1.0 / np.maximum(sums[rows], 1.0))
         receivers = members[first[rows[0]]:first[rows[-1] + 1]]
-        transfer[receivers] = body.exit(receivers, places.of[receivers] - rows[0], links.own, factors, products)
-        count += len(links.indices)
-        bound = max(bound, float(links.bound.max()))
+        transfer[receivers] = body.exit(receivers, places.of[receivers] - rows[0], block.own, factors, block.products)
+        count += block.links
+        bound = max(bound, block.bound)
         yield progress + 0.5 * (rows[-1] + 1) / len(tree.points)
     return _Gathered(transfer, factors, sums, sums * factors, count / len(tree.points), bound)
 

@@ -17,14 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.directions import tangent_frames
-from .dipole import Medium, Poles, diffuse_reflectance, disc_integral, plane_integral, steepest
-from .sample_tree import SampleTree
+from .dipole import (
+    Medium,
+    Poles,
+    diffuse_reflectance,
+    disc_integral,
+    mean_reflectance,
+    plane_integral,
+    slope_and_curvature,
+)
+from .sample_tree import COLUMNS, ROWS, SampleTree
 
 # Places that share their list of nodes.
 GROUP = 8
-# Discs whose radius is more than this share of their distance (depth included) are integrated; beyond, the middle of
-# the disc is within 9/8 (1/6)^2 = 3 % of R_d's mean, and little light comes from there where that matters (z < radius).
-NEAR = 1.0 / 6.0
+# Discs whose radius is more than this share of their distance (depth included) are integrated; beyond, R_d's mean to
+# second order is within (225/192) (1/3)^4 = 1.5 % of the disc's (R_d falling as r^-3).
+NEAR = 1.0 / 3.0
 # Points closer than this share of the object's size are one place (the corners of a vertex that a sharp edge splits).
 SAME_PLACE = 1e-7
 # A rule of degree 5 over the unit disc: its middle with weight 1/4, six points at radius sqrt(2/3) with 1/8 each
@@ -38,8 +46,8 @@ class Places:
 
     of: (r,) the place of each receiver, in the tree's order; areas: (r,) of the receivers; tree: over the places;
     frames: (p, 3, 3) tangent, bitangent and normal of their discs; kernels: the distinct ones among the channels;
-    kernel_of: the kernel of each of the 3 channels; where (3, c), sizes (c,): the matrix's columns, that is samples
-    and then nodes, and their areas.
+    kernel_of: the kernel of each of the 3 channels; where (c, 3), sizes (c,), covariance (c, 6): of the matrix's
+    columns, that is samples and then nodes: centre, area, and covariance of the surface about the centre.
     """
 
     of: NDArray[np.int64]
@@ -50,6 +58,7 @@ class Places:
     kernel_of: tuple[int, ...]
     where: NDArray[np.float64]
     sizes: NDArray[np.float64]
+    covariance: NDArray[np.float32]
 
     @staticmethod
     def of_receivers(points: NDArray[np.float64], normals: NDArray[np.float64], areas: NDArray[np.float64],
@@ -62,27 +71,31 @@ class Places:
         cell = np.rint(located / SAME_PLACE).astype(np.int64)
         _, chosen, place = np.unique(cell, axis=0, return_index=True, return_inverse=True)
         place = place.reshape(-1)
-        tree = SampleTree.over(located[chosen], np.bincount(place, weights=areas / size**2))
+        together = np.bincount(place, weights=areas / size**2)
         towards = np.stack([np.bincount(place, weights=areas * normals[:, axis]) for axis in range(3)], axis=1)
         length = np.sqrt(np.sum(towards**2, axis=1, keepdims=True))
         # Opposite sides at one place cancel; any disc through it is as good as another.
         towards = np.where(length > 1e-6 * length.max(), towards / np.maximum(length, np.finfo(np.float64).tiny),
                            normals[chosen])
+        # A disc of area A has the variance A / 4pi along each of its tangents.
+        flat = np.eye(3)[ROWS, COLUMNS] - towards[:, ROWS] * towards[:, COLUMNS]
+        tree = SampleTree.over(located[chosen], together, together[:, None] / (4.0 * np.pi) * flat)
         position = np.empty_like(tree.order)
         position[tree.order] = np.arange(len(position))
         poles = [medium.poles(channel, size) for channel in range(3)]
         kernels = tuple(dict.fromkeys(poles))
-        where = np.ascontiguousarray(np.concatenate([tree.points, tree.centre]).T)
-        return Places(position[place], areas / size**2, tree, tangent_frames(towards)[tree.order], kernels,
-                      tuple(kernels.index(p) for p in poles), where, tree.summed(tree.areas))
+        frames = tangent_frames(towards)[tree.order]
+        discs = tree.areas[:, None] / (4.0 * np.pi) * flat[tree.order]
+        return Places(position[place], areas / size**2, tree, frames, kernels, tuple(kernels.index(p) for p in poles),
+                      np.concatenate([tree.points, tree.centre]), tree.summed(tree.areas),
+                      np.concatenate([discs, tree.covariance]).astype(np.float32))
 
 
 @dataclass(frozen=True)
 class Links:
-    """A block of rows: a CSR pattern over samples and nodes, and per kernel the mean of R_d over each.
+    """Some rows: a CSR pattern over samples and nodes, and per kernel the mean of R_d over each.
 
-    A place has no link to itself. own: (rows, k) what is left of its own disc, see above. bound: (rows,) no row's sum
-    with values of at most 1 is further off than this.
+    A place has no link to itself. own: (rows, k) what is left of its own disc, see above.
     """
 
     rows: NDArray[np.int64]
@@ -90,30 +103,33 @@ class Links:
     indices: NDArray[np.int32]
     values: list[NDArray[np.float32]]
     own: NDArray[np.float64]
-    bound: NDArray[np.float64]
 
 
-def linked(places: Places, groups: NDArray[np.int64], tolerance: float) -> Links:
-    """The rows of some adjacent groups (nodes of one level of the tree)."""
+def linked(places: Places, groups: NDArray[np.int64], tolerance: float) -> tuple[list[Links], NDArray[np.float64]]:
+    """The rows of some groups (nodes of one level of the tree), and the error bound (groups,) of each group's rows
+    for values of at most 1.
+
+    Places of a group take the same nodes, so there is one `Links` with the first place of every group, one with the
+    second and so on, all with one pattern.
+    """
     tree = places.tree
     group, node, bound = _accepted(places, groups, tolerance)
-    column = np.where(tree.count[node] == 1, tree.first[node], len(tree.points) + node).astype(np.int32)
-    column = column[np.argsort(group, kind="stable")]
-    links = np.bincount(group, minlength=len(groups))
-    owner = np.repeat(np.arange(len(groups)), tree.count[groups])
-    rows = tree.first[groups[0]] + np.arange(len(owner))
-    indptr = np.concatenate([[0], np.cumsum(links[owner])])
-    shift = (np.cumsum(links) - links)[owner] - indptr[:-1]
-    indices = column[np.arange(indptr[-1]) + np.repeat(shift, links[owner])]
-    return Links(rows, indptr, indices, *_values(places, rows, indptr, indices), bound[owner])
+    order = np.argsort(group, kind="stable")
+    group, node = group[order], node[order]
+    indices = np.where(tree.count[node] == 1, tree.first[node], len(tree.points) + node).astype(np.int32)
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(group, minlength=len(groups)))])
+    columns = _Columns.of(places, group, indices)
+    first, size = tree.first[groups], tree.count[groups]
+    rows = [first + np.minimum(turn, size - 1) for turn in range(size.max())]
+    return [Links(r, indptr, indices, *columns.values(r)) for r in rows], bound
 
 
 def fully_linked(places: Places, rows: NDArray[np.int64]) -> Links:
     """Rows without a hierarchy: every sample on its own."""
     number = len(places.tree.points)
-    indptr = np.arange(len(rows) + 1) * number
     indices = np.tile(np.arange(number, dtype=np.int32), len(rows))
-    return Links(rows, indptr, indices, *_values(places, rows, indptr, indices), np.zeros(len(rows)))
+    columns = _Columns.of(places, np.repeat(np.arange(len(rows)), number), indices)
+    return Links(rows, np.arange(len(rows) + 1) * number, indices, *columns.values(rows))
 
 
 def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
@@ -130,8 +146,7 @@ def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
         single = tree.count[node] == 1
         taken.append((group[single], node[single]))
         group, node = group[~single], node[~single]
-        error, allowed = _errors(places, groups[group], node, tolerance)
-        enough = (error <= allowed).all(axis=0)
+        enough, error = _judged(places, groups[group], node, tolerance)
         taken.append((group[enough], node[enough]))
         for kernel in range(len(bound)):
             bound[kernel] += np.bincount(group[enough], error[kernel, enough] * sizes[node[enough]], len(groups))
@@ -140,62 +155,79 @@ def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
     return np.concatenate([t[0] for t in taken]), np.concatenate([t[1] for t in taken]), bound.max(axis=0)
 
 
-def _errors(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], tolerance: float,
-            ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Bound of the error of R_d, and what is allowed of it, for n pairs of nodes, per kernel (k, n).
+def _judged(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], tolerance: float,
+            ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Which of n nodes are good enough for the places of a group, and the bound (k, n) of the error of R_d.
 
-    Light of a node taken at its centre instead of at y is wrong by at most |y - centre| times R_d's steepest slope;
-    the mean of |y - centre| is at most the spread. Half of the allowance is in proportion to what the node gives, half
-    to its area, so that over all nodes the error is at most tolerance times the half-space's R: small nodes near the
-    receiver, one for the whole body where light no longer reaches.
+    With s^2 the surface's variance, light of a node taken at its centre instead of at y is wrong by at most
+    |y - centre| (mean at most s) times R_d's steepest slope, and the second-order term adds at most half the largest
+    curvature times s^2. The bound holds for any light; where light is alike over a node the first order cancels, so
+    what decides is the second: curvature times s^2 against R_d and R over the body's area. Half of the allowance is so
+    in proportion to what a node gives, half to its area: small nodes near the place, one for the whole body where
+    light no longer reaches.
     """
     tree, whole = places.tree, places.sizes[len(places.tree.points)]
     apart = tree.centre[node] - tree.centre[group]
-    distance = np.sqrt(np.sum(apart * apart, axis=1))
-    nearest = np.maximum(distance - tree.reach[group] - tree.extent[node], 0.0)
-    furthest = (distance + tree.reach[group] + tree.extent[node]) ** 2
-    error, allowed = np.empty((2, len(places.kernels), len(node)))
+    squared = np.sum(apart * apart, axis=1)
+    nearest = np.maximum(np.sqrt(squared) - tree.reach[group] - tree.extent[node], 0.0)
+    variance = np.sum(tree.covariance[node, :3], axis=1)
+    enough = np.ones(len(node), bool)
+    error = np.empty((len(places.kernels), len(node)))
     for index, poles in enumerate(places.kernels):
+        slope, curvature = slope_and_curvature(poles, nearest)
+        second = curvature * variance
+        error[index] = slope * np.sqrt(variance) + 0.5 * second
         # A body far smaller than the depth returns far less than R, at most its area times R_d(0).
         floor = min(plane_integral(poles) / whole, float(diffuse_reflectance(poles, np.zeros(1))[0]))
-        error[index] = tree.spread[node] * steepest(poles, nearest)
-        allowed[index] = 0.5 * tolerance * (diffuse_reflectance(poles, furthest) + floor)
-    return error, allowed
+        enough &= second <= 0.5 * tolerance * (diffuse_reflectance(poles, squared) + floor)
+    return enough, error
 
 
-def _values(places: Places, rows: NDArray[np.int64], indptr: NDArray[np.int64], indices: NDArray[np.int32],
-            ) -> tuple[list[NDArray[np.float32]], NDArray[np.float64]]:
-    """The mean of R_d over every column of some rows, per kernel, 0 for a place's own column; and `own` of Links."""
-    per_row = np.diff(indptr)
-    squared = np.zeros(len(indices))
-    for axis in range(3):
-        apart = np.repeat(places.where[axis, rows], per_row)
-        apart -= np.take(places.where[axis], indices)
-        apart *= apart
-        squared += apart
-    squared = squared.astype(np.float32)
-    row = np.repeat(np.arange(len(rows), dtype=np.int32), per_row)
-    itself = np.flatnonzero(rows[row] == indices)
-    squared[itself] = 1e30  # not near
-    near = _near(places, indices, squared)
-    field = _NearField.of(places, rows, row[near], indices[near])
-    values, own = [], np.empty((len(rows), len(places.kernels)))
-    for kernel, poles in enumerate(places.kernels):
-        value = diffuse_reflectance(poles, squared)
-        value[itself] = 0.0
-        value[near], own[:, kernel] = field.values(poles)
-        values.append(value)
-    return values, own
+@dataclass(frozen=True)
+class _Columns:
+    """The columns of n links of some rows, gathered once. row: (n,) index of the row; column: (n,); where (3, n),
+    covariance (6, n) float32, about `origin` so that single precision resolves what is near; limit: (n,) see NEAR."""
 
+    places: Places
+    row: NDArray[np.int64]
+    column: NDArray[np.int32]
+    origin: NDArray[np.float64]
+    where: NDArray[np.float32]
+    covariance: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    limit: NDArray[np.float32]
 
-def _near(places: Places, indices: NDArray[np.int32], squared: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The pairs whose disc is large against its distance, see NEAR."""
-    number = len(places.tree.points)
-    # Nodes have no disc, and a place without an area gives nothing.
-    limit = np.zeros(len(places.sizes), np.float32)
-    limit[:number] = places.tree.areas / (np.pi * NEAR * NEAR)
-    shallowest = min(poles.real for poles in places.kernels)
-    return np.flatnonzero(np.take(limit, indices) > squared + np.float32(shallowest**2))
+    @staticmethod
+    def of(places: Places, row: NDArray[np.int64], column: NDArray[np.int32]) -> _Columns:
+        number = len(places.tree.points)
+        # The largest squared distance, depth included, at which a disc is near. Nodes have no disc, and a place
+        # without an area gives nothing.
+        limit = np.zeros(len(places.sizes), np.float32)
+        limit[:number] = places.tree.areas / (np.pi * NEAR * NEAR)
+        limit[:number] -= min(poles.real for poles in places.kernels) ** 2
+        origin = places.where[column[0]]
+        where = (places.where - origin).astype(np.float32)
+        covariance = np.ascontiguousarray(places.covariance[column].T)
+        return _Columns(places, row, column, origin, np.ascontiguousarray(where[column].T), covariance,
+                        covariance[:3].sum(axis=0), limit[column])
+
+    def values(self, rows: NDArray[np.int64]) -> tuple[list[NDArray[np.float32]], NDArray[np.float64]]:
+        """The mean of R_d over every column, per kernel, 0 for a row's own place; and `own` of Links."""
+        position = (self.places.tree.points[rows] - self.origin).astype(np.float32)
+        x, y, z = (position[self.row, axis] - self.where[axis] for axis in range(3))
+        squared = x * x + y * y + z * z
+        c = self.covariance
+        along = x * (c[0] * x + 2.0 * (c[3] * y + c[4] * z)) + y * (c[1] * y + 2.0 * c[5] * z) + c[2] * z * z
+        itself = self.column == rows[self.row]
+        near = np.flatnonzero((squared < self.limit) & ~itself)
+        field = _NearField.of(self.places, rows, self.row[near], self.column[near])
+        values, own = [], np.empty((len(rows), len(self.places.kernels)))
+        for kernel, poles in enumerate(self.places.kernels):
+            value = mean_reflectance(poles, squared, self.spread, along)
+            value[itself] = 0.0
+            value[near], own[:, kernel] = field.values(poles)
+            values.append(value)
+        return values, own
 
 
 @dataclass(frozen=True)
@@ -203,14 +235,14 @@ class _NearField:
     """n near pairs of some rows. row: (n,); area, facing: (n,) of the other disc; own: (rows,) areas of the places;
     squared: (7, n) float32 distances from the place to the rule's points on the other disc, the middle first."""
 
-    row: NDArray[np.int32]
+    row: NDArray[np.int64]
     area: NDArray[np.float64]
     facing: NDArray[np.bool_]
     own: NDArray[np.float64]
     squared: NDArray[np.float32]
 
     @staticmethod
-    def of(places: Places, rows: NDArray[np.int64], row: NDArray[np.int32], column: NDArray[np.int32]) -> _NearField:
+    def of(places: Places, rows: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int32]) -> _NearField:
         tree, place = places.tree, rows[row]
         apart = tree.points[column] - tree.points[place]
         frames = places.frames[column]
