@@ -40,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mesh", default="buddha_nirj.obj")
     parser.add_argument("--radius", type=float, nargs=3, default=(0.2, 0.1, 0.05))
-    parser.add_argument("--tolerances", type=float, nargs="+", default=(4.0, 2.0, 1.0, 0.5))
+    parser.add_argument("--tolerances", type=float, nargs="+", default=(0.08, 0.04, 0.02, 0.01, 0.005))
     parser.add_argument("--paths", type=float, nargs="*", default=(1e-4, 1e-3, 1e-2, 1e-1, 1.0, 1e2))
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--checked", type=int, default=100)

@@ -197,9 +197,10 @@ def slope_and_curvature(poles: Poles, nearest: NDArray[np.float64]) -> tuple[NDA
         q = poles.decay * np.sqrt(squared)
         factor = poles.alpha * depth / (4.0 * np.pi) * np.exp(-q)
         first = 3.0 + 3.0 * q + q * q
+        curvature += factor * (5.0 * first + q * q * (1.0 + q)) / (squared * squared * np.sqrt(squared))
         top = np.maximum(nearest, 0.5 * depth)
-        slope += factor * first * top * (top * top + depth * depth) ** -2.5
-        curvature += factor * (5.0 * first + q * q * (1.0 + q)) * squared**-2.5
+        squared = top * top + depth * depth
+        slope += factor * first * top / (squared * squared * np.sqrt(squared))
     return slope, curvature
 
 

@@ -29,7 +29,7 @@ from .dipole import (
 from .sample_tree import COLUMNS, ROWS, SampleTree
 
 # Places that share their list of nodes.
-GROUP = 8
+GROUP = 16
 # Discs whose radius is more than this share of their distance (depth included) are integrated; beyond, R_d's mean to
 # second order is within (225/192) (1/3)^4 = 1.5 % of the disc's (R_d falling as r^-3).
 NEAR = 1.0 / 3.0
@@ -138,7 +138,7 @@ def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
 
     All pairs of a level at once; what is not accepted is replaced by its two children.
     """
-    tree, sizes = places.tree, places.sizes[len(places.tree.points):]
+    tree = places.tree
     group, node = np.arange(len(groups)), np.zeros(len(groups), np.int64)
     bound = np.zeros((len(places.kernels), len(groups)))
     taken: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
@@ -149,7 +149,7 @@ def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
         enough, error = _judged(places, groups[group], node, tolerance)
         taken.append((group[enough], node[enough]))
         for kernel in range(len(bound)):
-            bound[kernel] += np.bincount(group[enough], error[kernel, enough] * sizes[node[enough]], len(groups))
+            bound[kernel] += np.bincount(group[enough], error[kernel, enough], len(groups))
         group, node = np.repeat(group[~enough], 2), np.repeat(node[~enough] * 2 + 1, 2)
         node[1::2] += 1
     return np.concatenate([t[0] for t in taken]), np.concatenate([t[1] for t in taken]), bound.max(axis=0)
@@ -157,29 +157,31 @@ def _accepted(places: Places, groups: NDArray[np.int64], tolerance: float,
 
 def _judged(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], tolerance: float,
             ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Which of n nodes are good enough for the places of a group, and the bound (k, n) of the error of R_d.
+    """Which of n nodes are good enough for the places of a group, and the bound (k, n) of their error.
 
     With s^2 the surface's variance, light of a node taken at its centre instead of at y is wrong by at most
     |y - centre| (mean at most s) times R_d's steepest slope, and the second-order term adds at most half the largest
-    curvature times s^2. The bound holds for any light; where light is alike over a node the first order cancels, so
-    what decides is the second: curvature times s^2 against R_d and R over the body's area. Half of the allowance is so
-    in proportion to what a node gives, half to its area: small nodes near the place, one for the whole body where
-    light no longer reaches.
+    curvature times s^2; times the node's area this bounds the error for any light of at most 1. Every node is allowed
+    the same, so that a link more buys about as much wherever it is added: small nodes near the place, one for the
+    whole body where light no longer reaches. (On the Buddha half the links of a share of what each node gives, and of
+    Jensen & Buhler's solid angle, at the same error: benchmarks/subsurface.py.)
     """
-    tree, whole = places.tree, places.sizes[len(places.tree.points)]
+    tree, number = places.tree, len(places.tree.points)
     apart = tree.centre[node] - tree.centre[group]
-    squared = np.sum(apart * apart, axis=1)
-    nearest = np.maximum(np.sqrt(squared) - tree.reach[group] - tree.extent[node], 0.0)
-    variance = np.sum(tree.covariance[node, :3], axis=1)
-    enough = np.ones(len(node), bool)
+    distance = np.sqrt(np.sum(apart * apart, axis=1))
+    nearest = np.maximum(distance - tree.reach[group] - tree.extent[node], 0.0)
+    variance, area = np.sum(tree.covariance[node, :3], axis=1), places.sizes[number + node]
+    spread = np.sqrt(variance)
+    # A place's own disc is a matter of the receiver (subsurface.py), so no node that holds one of the group is taken.
+    enough = (tree.first[node] >= tree.first[group] + tree.count[group]) | (
+        tree.first[group] >= tree.first[node] + tree.count[node])
     error = np.empty((len(places.kernels), len(node)))
     for index, poles in enumerate(places.kernels):
         slope, curvature = slope_and_curvature(poles, nearest)
-        second = curvature * variance
-        error[index] = slope * np.sqrt(variance) + 0.5 * second
+        error[index] = area * (slope * spread + 0.5 * curvature * variance)
         # A body far smaller than the depth returns far less than R, at most its area times R_d(0).
-        floor = min(plane_integral(poles) / whole, float(diffuse_reflectance(poles, np.zeros(1))[0]))
-        enough &= second <= 0.5 * tolerance * (diffuse_reflectance(poles, squared) + floor)
+        most = float(diffuse_reflectance(poles, np.zeros(1))[0]) * places.sizes[number]
+        enough &= error[index] <= tolerance * min(plane_integral(poles), most)
     return enough, error
 
 
