@@ -72,14 +72,17 @@ def _longest_edges(scene: SceneMesh) -> NDArray[np.float64]:
     return longest
 
 
-def fill_buried(scene: SceneMesh, buried: NDArray[np.int64], transfer: NDArray[np.float32]) -> int:
+def fill_buried(triangles: NDArray[np.int32], loose: NDArray[np.bool_], buried: NDArray[np.int64],
+                transfer: NDArray[np.float32]) -> int:
     """Give buried receivers at the rim the mean transfer of their open neighbours, in place; return how many.
 
-    transfer: (points, columns, channels). Neighbours share an edge; the second ring takes the first ring's values.
+    triangles: (t, 3) of an object, loose: (p,), buried: (b,) places, transfer: (p, ...), all of the same points.
+    Neighbours share an edge; the second ring takes the first ring's values.
     """
-    open_points = ~scene.loose
+    open_points = ~loose
     open_points[buried] = False
-    edges = np.concatenate([scene.triangles[:, [0, 1]], scene.triangles[:, [1, 2]], scene.triangles[:, [2, 0]]])
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    edges = edges[~open_points[edges].all(axis=1)]
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     filled = 0
     for _ in range(RINGS):
@@ -89,7 +92,7 @@ def fill_buried(scene: SceneMesh, buried: NDArray[np.int64], transfer: NDArray[n
         points, place = np.unique(rim[:, 0], return_inverse=True)
         total = np.zeros((len(points), *transfer.shape[1:]))
         np.add.at(total, place, transfer[rim[:, 1]])
-        transfer[points] = total / np.bincount(place)[:, None, None]
+        transfer[points] = total / np.bincount(place).reshape(-1, *[1] * (transfer.ndim - 1))
         open_points[points] = True
         filled += len(points)
     return filled
