@@ -52,7 +52,7 @@ def main() -> None:
 
     def run(medium: Medium, tolerance: float) -> tuple[float, Subsurface]:
         started = time.perf_counter()
-        result = drain(subsurface_transfer(points, scene.normals, areas, irradiance, medium, tolerance,
+        drain(subsurface_transfer(points, scene.normals, areas, irradiance, medium, tolerance,
                                            arguments.threads, checked=0))
         seconds = time.perf_counter() - started
         return seconds, drain(subsurface_transfer(points, scene.normals, areas, irradiance, medium, tolerance,

@@ -28,6 +28,7 @@ TYPICAL_HIT_SHARE = 0.5
 
 
 @dataclass(frozen=True)
+class Plan:
     """needs: what the scene needs; surfaces: what its materials get; receivers: baked; seconds: expected for each stage
     that will run; rays: expected for each; peak_bytes, stored_bytes: expected."""
 
