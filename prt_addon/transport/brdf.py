@@ -195,9 +195,14 @@ def reflection_matrix(reflection: Reflection, functions: Indices, incident: Indi
     known to rounding `hemisphere.SINGLE_PRECISION` or lower.
     """
     incident = np.arange(reflection.order ** 2) if incident is None else np.asarray(incident, np.int64)
-    outgoing = outgoing_matrix(reflection, functions, smallest)[:, incident]
+    whole = outgoing_matrix(reflection, functions, smallest)
     basis = hemisphere.hemisphere_basis(incident, smallest_incident)
-    return np.ascontiguousarray(np.moveaxis(basis.fit(np.moveaxis(outgoing, 1, 0)), 0, 1))
+    matrix = np.ascontiguousarray(np.moveaxis(basis.fit(np.moveaxis(whole[:, incident], 1, 0)), 0, 1))
+    # What was not inverted is missing from a white surrounding too, some percent of a narrow lobe. The smallest change
+    # that returns its light exactly is of rank one: no energy is made or lost.
+    white = hemisphere.gram_matrix(np.union1d(incident, 0))[0, np.searchsorted(np.union1d(incident, 0), incident)]
+    missing = whole[:, 0] - np.sum(matrix * white[:, None], axis=1)
+    return matrix + missing[:, None] * (white / np.sum(white ** 2))[:, None]
 
 
 def _turned(matrix: Array, functions: Indices, reflection: Reflection) -> Array:

@@ -114,8 +114,13 @@ def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.Wo
     return world
 
 
+# Everything that a camera sees of a surface, colours included.
+ALL_LIGHT = {"DIRECT", "INDIRECT", "DIFFUSE", "GLOSSY", "TRANSMISSION", "EMIT"}
+
+
 def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) -> np.ndarray:
-    """Unit-albedo exit radiance (v, 3) of an object's vertices under the scene's light, baked by Cycles."""
+    """Exit radiance (v, 3) of an object's vertices under the scene's light, baked by Cycles: for unit albedo and of
+    diffuse light, or, with ALL_LIGHT, all of it towards the scene's camera."""
     mesh = thing.data
     attribute = mesh.color_attributes.get("bake") or mesh.color_attributes.new("bake", "FLOAT_COLOR", "POINT")
     mesh.color_attributes.active_color = attribute
@@ -123,8 +128,10 @@ def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) ->
     bpy.context.view_layer.objects.active = thing
     thing.select_set(True)
     bpy.context.scene.cycles.seed = seed
-    bpy.context.scene.render.bake.use_pass_color = False
-    bpy.ops.object.bake(type="DIFFUSE", pass_filter=passes, target="VERTEX_COLORS", use_clear=True)
+    bake = bpy.context.scene.render.bake
+    bake.use_pass_color, bake.view_from = False, "ACTIVE_CAMERA" if passes == ALL_LIGHT else "ABOVE_SURFACE"
+    bpy.ops.object.bake(type="COMBINED" if passes == ALL_LIGHT else "DIFFUSE", pass_filter=passes,
+                        target="VERTEX_COLORS", use_clear=True)
     colours = np.empty(4 * len(mesh.vertices), np.float32)
     mesh.color_attributes["bake"].data.foreach_get("color", colours)
     mesh.color_attributes.remove(mesh.color_attributes["bake"])
@@ -132,7 +139,7 @@ def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) ->
 
 
 def shown_radiance(thing: bpy.types.Object, passes: set[str], vertices: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Unit-albedo exit radiance (v, 3) that Cycles shows around some vertices of an object.
+    """Exit radiance (v, 3) that Cycles shows around some vertices of an object; passes: as for `vertex_radiance`.
 
     A vertex bake stands on the corner itself, where Cycles leaves out only the one face that a ray starts on and lets
     part of the light from under it through; on coarse smooth-shaded meshes no render shows that value. What a render
