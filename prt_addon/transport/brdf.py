@@ -225,7 +225,7 @@ def explained(material: SurfaceMaterial, functions: Indices, order: int) -> floa
 # A highlight whose mean albedo is below half a step of an 8-bit display changes no pixel.
 INVISIBLE = 0.5 / 255
 # Below this share of the lobe the picture would be a blur in place of a reflection: a metal below roughness 0.20 at
-# order 5 and 0.17 at order 10, a dielectric (whose grazing reflections are sharper) below 0.28 and 0.25.
+# order 5 and 0.18 at order 10, a dielectric (whose grazing reflections are sharper) below 0.28 and 0.25.
 MIRROR = 0.05
 # Rows are added until they hold this share of what the light's order can show (squared: 10 % RMS is left).
 ENOUGH = 0.99
