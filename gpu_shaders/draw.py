@@ -92,7 +92,7 @@ class ObjectDrawing:
         program.bind()
         program.uniform_sampler("exit_values", self._exit if self._colours is None else self._colours)
         program.uniform_float("transform", Matrix(transform.tolist()))
-        if depends_on_view:
+        if depends_on_view and programs.sees_viewer(self.data.functions):
             program.uniform_float("viewer", viewer_of(transform).tolist())
         program.uniform_float("exposure", exposure)
         program.uniform_float("albedo_share", 1.0 if use_albedo else 0.0)

@@ -61,6 +61,11 @@ def surface() -> gpu.types.GPUShader:
     return gpu.shader.create_from_info(info)
 
 
+def sees_viewer(functions: tuple[int, ...]) -> bool:
+    """Whether some function is not constant. Where none is, nothing of the viewer is declared: see above."""
+    return any(functions)
+
+
 @functools.cache
 def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     """The program that draws a lit surface whose radiance depends on the view: see view_surface.vert.glsl.
@@ -68,7 +73,8 @@ def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     functions: of the view, one for each row but the first. Raises PRTError where the driver passes too few numbers
     from vertices to fragments.
     """
-    names = ["diffuse_radiance", *hemisphere_glsl.row_names(functions), "surface_albedo", "local_view"]
+    names = ["diffuse_radiance", *hemisphere_glsl.row_names(functions), "surface_albedo"]
+    names += ["local_view"] if sees_viewer(functions) else []
     most = gpu.capabilities.max_varying_floats_get() // 4  # each takes a slot of four
     if len(names) > most:
         raise PRTError("the preview", f"the graphics driver passes {most} values to a pixel, this bake needs "
@@ -85,7 +91,9 @@ def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.sampler(0, "FLOAT_2D", "exit_values")
     info.push_constant("MAT4", "transform")
-    info.push_constant("VEC4", "viewer")
+    if sees_viewer(functions):
+        info.define("SEES_VIEWER")
+        info.push_constant("VEC4", "viewer")
     info.push_constant("FLOAT", "exposure")
     info.push_constant("FLOAT", "albedo_share")
     fetch, total = hemisphere_glsl.fetch_rows(functions), hemisphere_glsl.sum_rows(functions)
