@@ -199,13 +199,16 @@ def viewer_of(transform: ArrayLike) -> NDArray[np.float64]:
     (x, y, z, 1) is the eye of a perspective view; (x, y, z, 0) the unit direction towards the viewer of an
     orthographic one. Either way `viewer.xyz - viewer.w * point` points from a point to the viewer. The eye is what
     the transform takes to x = y = w = 0: the cross product in four dimensions of these three rows. It does not depend
-    on the depth range (nor on a depth bias), which would cost digits in an inverse.
+    on the depth range (nor on a depth bias), which would cost digits in an inverse. A transform that flattens, which
+    shows nothing, has no viewer: (0, 0, 1, 0).
     """
     rows = np.asarray(transform, np.float64)
-    others = rows[[0, 1, 3]] / np.abs(rows[[0, 1, 3]]).max(axis=1, keepdims=True)
+    others = rows[[0, 1, 3]] / np.maximum(np.abs(rows[[0, 1, 3]]).max(axis=1, keepdims=True), 1e-300)
     viewer = np.array([(-1) ** k * np.linalg.det(np.delete(others, k, axis=1)) for k in range(4)])  # small
     if rows[2] @ viewer > 0.0:  # small; in front of the near plane, never behind the far one
         viewer = -viewer
     largest = np.abs(viewer[:3]).max()
+    if not np.abs(viewer).max() > 1e-12:
+        return np.array([0.0, 0.0, 1.0, 0.0])
     return viewer / viewer[3] if abs(viewer[3]) > 1e-12 * largest else np.append(
         viewer[:3] / np.sqrt(np.sum(viewer[:3] ** 2)), 0.0)

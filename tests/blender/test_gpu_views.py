@@ -265,6 +265,14 @@ def test_the_viewer_is_found_in_the_transform(scene: bpy.types.Scene, kind: str)
             assert np.allclose(moved, wanted, atol=1e-5 * max(np.abs(wanted).max(), size))
 
 
+def test_a_flattened_object_breaks_nothing(scene: bpy.types.Scene) -> None:
+    aim(scene, "PERSP")
+    baked, light = glossy(ROW_SETS["9"])
+    for scale in ((0.0, 1.0, 1.0), (0.0, 0.0, 0.0)):
+        picture = offscreen.draw_camera(scene, [(baked, np.diag([*scale, 1.0]))], light, 16, 16)
+        assert np.isfinite(picture).all()
+
+
 def test_signature_follows_what_view_dependent_drawing_reads() -> None:
     baked, _ = glossy(ROW_SETS["9"])
     signature = render_data.transfer_signature(baked)
