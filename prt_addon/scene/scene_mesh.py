@@ -18,7 +18,7 @@ from .object_mesh import ObjectMesh, bounding_diagonal, clean
 from .orientation import outward
 from .refinement import Beside, EdgeLimit, refine
 from .surface_material import DIFFUSE, SurfaceMaterial
-from .tangents import smooth_tangents, tangent_frame
+from .tangents import UP, quiet_pole, smooth_tangents, tangent_frame
 
 # Corners of one vertex whose normals differ by less than 0.25 degrees, or albedos by less than half an 8-bit step, are
 # one receiver: below what interpolation shows, above the noise of Blender's packed custom normals.
@@ -191,7 +191,8 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
     beside = Beside(np.zeros(count, np.int32), None)
     beside.material[group] = np.repeat(material, 3)
     if tangent is not None:
-        beside.tangents = tangent_frame(_mean_per_group(mesh.corner_tangents.reshape(-1, 3), group, count), normals)
+        wanted = _mean_per_group(mesh.corner_tangents.reshape(-1, 3), group, count)
+        beside.tangents = tangent_frame(wanted, normals, quiet_pole(normals))
     matches = count == len(mesh.positions)
     if limit.longest > 0.0:
         before = len(points)
@@ -199,7 +200,9 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
         if len(points) != before:
             matches = False
             warnings.append(f"{mesh.name}: refined from {before} to {len(points)} receivers")
-    tangents = smooth_tangents(normals) if beside.tangents is None else beside.tangents
+    tangents = beside.tangents
+    if tangents is None:  # of diffuse points nobody asks
+        tangents = smooth_tangents(normals, quiet_pole(normals) if beside.material.any() else UP)
     return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material, tangents, matches)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -260,3 +261,47 @@ def test_generated_coordinates_come_from_before_deformation(scene: bpy.types.Sce
     after = SceneMesh.assemble(read_objects(depsgraph()))
     assert np.allclose(after.points, before.points + np.array([7.0, 0, 0]), atol=1e-4)
     assert np.allclose(after.tangents, before.tangents, atol=1e-4)
+
+
+def render_of_cycles(build: Build, folder: Path) -> np.ndarray:
+    """A sphere of this material under two Suns, direct light only: (32, 32, 3)."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=32, ring_count=24)
+    bpy.ops.object.shade_smooth()
+    bpy.context.object.data.materials.append(add_material("M", build))
+    for turn, energy in (((0.6, 0.2, 0.0), 3.0), ((1.2, 0.0, 1.0), 2.0)):
+        sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+        sun.data.energy, sun.rotation_euler = energy, turn
+        scene.collection.objects.link(sun)
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 2.2
+    scene.camera.location, scene.camera.rotation_euler = (0.0, -4.0, 4.0), (np.pi / 4, 0.0, 0.0)
+    scene.collection.objects.link(scene.camera)
+    scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 16, 0
+    scene.cycles.use_denoising = False
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(folder / "render.exr")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    return np.array(image.pixels[:]).reshape(32, 32, 4)[..., :3]
+
+
+@pytest.mark.parametrize("anisotropy", [0.4, -0.4])
+def test_glossy_read_as_principled_renders_the_same_in_cycles(tmp_path: Path, anisotropy: float) -> None:
+    values = {"Color": (0.8, 0.4, 0.1, 1), "Roughness": 0.5, "Anisotropy": anisotropy, "Rotation": 0.1}
+    build = one_node("ShaderNodeBsdfAnisotropic", values, distribution="GGX")
+    original, found = render_of_cycles(build, tmp_path), read(build)
+
+    def principled(turn: float) -> Build:
+        return one_node("ShaderNodeBsdfPrincipled", {
+            "Base Color": (*found.base_colour, 1), "Roughness": found.roughness, "Metallic": found.metallic,
+            "Specular Tint": (*found.specular_tint, 1), "Anisotropic": found.anisotropic,
+            "Anisotropic Rotation": found.anisotropic_rotation + turn}, distribution="GGX")
+
+    def difference(turn: float) -> float:
+        rendered = render_of_cycles(principled(turn), tmp_path)
+        return float(np.sqrt(((rendered - original) ** 2).mean() / (original ** 2).mean()))
+    assert difference(0.0) < 1e-3
+    assert difference(0.25) > 0.3

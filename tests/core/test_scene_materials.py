@@ -13,7 +13,7 @@ from prt_addon.baking.job import read_job, write_job
 from prt_addon.baking.settings import BakeSettings
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.scene.surface_material import DIFFUSE, SurfaceMaterial
-from prt_addon.scene.tangents import smooth_tangents, tangent_frame
+from prt_addon.scene.tangents import quiet_pole, smooth_tangents, tangent_frame
 from tests.core.shapes import box, plane, sphere
 
 GLOSSY = SurfaceMaterial("Varnish", specular_level=0.5, roughness=0.3)
@@ -115,6 +115,20 @@ def test_smooth_tangents_are_continuous_away_from_straight_down() -> None:
                      tangent_frame(special * 2.0, special), tangent_frame(special * np.nan, special)):
         assert np.abs(np.linalg.norm(tangents, axis=1) - 1.0).max() < 1e-12
         assert np.abs(np.sum(tangents * special, axis=1)).max() < 1e-9
+
+
+def test_frames_of_a_room_and_of_a_bumpy_ceiling_do_not_spin() -> None:
+    random = np.random.default_rng(3)
+    walls = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 500, axis=0)
+    normals = unit(walls + 1e-2 * random.normal(size=walls.shape))
+    tangents = smooth_tangents(normals, quiet_pole(normals)).reshape(6, 500, 3)
+    assert np.sum(tangents * tangents[:, :1], axis=2).min() > 0.99
+    ceiling = normals[5 * 500:]
+    assert np.sum(smooth_tangents(ceiling, quiet_pole(ceiling)) * smooth_tangents(ceiling, quiet_pole(ceiling))[0],
+                  axis=1).min() > 0.99
+    ball = sphere(radius=0.1, centre=(0.5, 0.5, 0.5))
+    inward = SceneMesh.assemble([replace(box(inward=True), materials=(GLOSSY,)), ball])
+    assert_frames(inward)
 
 
 def test_misfits_of_a_reader_are_refused() -> None:
