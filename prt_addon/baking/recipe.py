@@ -384,7 +384,8 @@ class _Bake:
             inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
             place = np.cumsum(~self.scene.loose[target.points]) - 1
             rows = place[keys[inside] - target.points.start]
-            result[inside] = decoded(encodings[target.name], rows).reshape(len(inside), -1, *shape)[:, 0]
+            values = decoded(encodings[target.name], rows)
+            result[inside] = values.reshape(len(inside), self.shapes[target.name][0], *shape)[:, 0]
         return result
 
     def _result(self, gathered: Gather | None, bounced: Interreflection | None, transfer: NDArray[np.float32],
