@@ -248,6 +248,9 @@ class _Bake:
             indirect = IndirectLight(gathered.hits, source, visibility.rows, visibility.blocked)
         found = yield from self._follow("glossy", glossy_transfer(
             self.tracer, surfaces, self.plan.needs.order, visibility.visible, indirect))
+        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]] for number in used], np.float32)
+        if (windows < 1.0).any():
+            found *= windows[surfaces.material][:, None, :, None]
         rows = np.zeros((len(scene.points), *found.shape[1:3], channels), np.float32)
         rows[points] = found  # one channel serves all three
         self._save("glossy", {"rows": rows})

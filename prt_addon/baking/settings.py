@@ -32,6 +32,7 @@ class BakeSettings:
         are diffuse. Each row costs as much as the whole diffuse transfer.
     glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
         most); below, its light stays in the diffuse layer.
+    glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
     fit_order_to_light: lower the order to what the scene's present light carries.
     threads: 0 = one per core. seed: of all random choices.
@@ -52,6 +53,7 @@ class BakeSettings:
     error_paths: int = 8192
     glossy_rows: int = 16
     glossy_albedo: float = 0.15
+    glossy_window: bool = True
     subsurface: bool = True
     fit_order_to_light: bool = False
     threads: int = 0

@@ -12,10 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.hemisphere import Indices, functions_of, gram_matrix
+from ..basis.spherical_harmonics import expand_bands
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..scene.surface_material import SurfaceMaterial
-from ..transport.brdf import Reflection, choose_rows, diffuse_left, reflection_matrix, reflection_of_material
+from ..transport.brdf import (
+    Reflection,
+    choose_rows,
+    diffuse_left,
+    reflection_matrix,
+    reflection_of_material,
+    ringing_window,
+)
 from .settings import BakeSettings
 
 # Order of the functions that incident radiance is turned and reflected in, and the smallest eigenvalue of their Gram
@@ -34,13 +42,15 @@ _GREY = 1e-6
 class SurfacePart:
     """How one material is held.
 
-    kernel: (rows, incident functions, 1 or 3), None where it has no rows of its own; diffuse_share: of its diffuse
+    kernel: (rows, incident functions, 1 or 3), None where it has no rows of its own; window: (columns,) factors on the
+    light that a highlight sharper than the light's order reflects; diffuse_share: of its diffuse
     layer that the layers above leave, a mean over views; dimming: (rows,) how that differs over views; highlight:
     (3,) mean share of the light that its highlight returns; translucent: subsurface light is baked.
     """
 
     material: SurfaceMaterial
     kernel: NDArray[np.float64] | None
+    window: NDArray[np.float64]
     diffuse_share: float
     dimming: NDArray[np.float64]
     highlight: NDArray[np.float64]
@@ -103,13 +113,13 @@ def plan_surfaces(scene: SceneMesh, settings: BakeSettings) -> SurfacePlan:
     left_out: list[LeftOut] = []
     hints: list[str] = []
     reflections: dict[int, Reflection] = {
-        number: reflection_of_material(material, INCIDENT_ORDER) for number, material in enumerate(scene.materials)
+        number: reflection_of_material(material, max(INCIDENT_ORDER, settings.order)) for number, material in enumerate(scene.materials)
         if material.specular_level > 0.0 or material.metallic > 0.0}
     rows = {number: _rows(scene.materials[number], reflections[number], settings, left_out, hints)
             for number in sorted(used & reflections.keys())}
     functions = functions_of(max(rows.values())) if any(rows.values()) else np.zeros(0, np.int64)
     parts = tuple(_part(material, reflections.get(number), functions if rows.get(number) else None, number in used,
-                        settings, left_out) for number, material in enumerate(scene.materials))
+                        settings, left_out, hints) for number, material in enumerate(scene.materials))
     return SurfacePlan(parts, functions, left_out, hints)
 
 
@@ -136,7 +146,7 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
 
 
 def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: Indices | None, is_used: bool,
-          settings: BakeSettings, left_out: list[LeftOut]) -> SurfacePart:
+          settings: BakeSettings, left_out: list[LeftOut], hints: list[str]) -> SurfacePart:
     """One material's part. functions: None where its highlight gets no rows."""
     highlight = np.zeros(3) if reflection is None else np.broadcast_to(reflection.albedo(), 3)
     translucent = material.is_translucent and settings.subsurface and is_used
@@ -145,12 +155,18 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
                                 "the subsurface stage and three channels"))
     through = 1.0 - material.subsurface_weight if translucent else 1.0
     if functions is None:
-        return SurfacePart(material, None, through, np.zeros(1), highlight, translucent)
-    kernel = reflection_matrix(reflection, functions, smallest_incident=SMALLEST_INCIDENT)
+        return SurfacePart(material, None, np.ones(1), through, np.zeros(1), highlight, translucent)
+    kernel = reflection_matrix(reflection, functions, np.arange(INCIDENT_ORDER ** 2), SMALLEST_INCIDENT)
     if kernel.shape[2] == 3 and np.ptp(kernel, axis=2).max() <= _GREY * np.abs(kernel).max():
         kernel = kernel[:, :, :1]
     left = diffuse_left(material, functions)
-    return SurfacePart(material, kernel, left.mean * through, left.coefficients * through, highlight, translucent)
+    bands = ringing_window(reflection, settings.order) if settings.glossy_window else np.ones(settings.order)
+    if bands[-1] < 1.0:
+        hints.append(f"the highlight of material {material.name}: light of order {settings.order} would ring in it; a"
+                     f" window leaves {bands[-1]:.0%} of the highest band (glossy_window=false keeps all)")
+    window = expand_bands(bands)
+    return SurfacePart(material, kernel, window, left.mean * through, left.coefficients * through, highlight,
+                       translucent)
 
 
 def row_metric(functions: Indices, albedo: NDArray[np.float32]) -> NDArray[np.float64] | None:

@@ -237,6 +237,41 @@ ENOUGH = 0.99
 ROW_COUNTS = (1, 4, 9, 16, 24, 25)
 
 
+# Negative lobe, relative to the peak, that a windowed highlight may keep: under a light a hundred times brighter than
+# its surroundings it then still darkens nothing.
+DEEPEST_LOBE = 0.01
+_PROFILE, _HALVINGS, _STRONGEST = 181, 24, 1.0
+
+
+def ringing_window(reflection: Reflection, order: int) -> Array:
+    """Factors per band (order,) on the light that a highlight reflects, so that its own profile does not ring below
+    -DEEPEST_LOBE of its peak. All ones where light of this order holds it.
+
+    Light cut at an order is negative beside every small bright source. Diffuse reflection blurs that away, a highlight
+    sharper than the order shows it as black rings. The profile is that of the highlight seen along the normal, a
+    function of one angle; of the windows the heat kernel loses least (see spherical_harmonics.window), and the weakest
+    that suffices is found by bisection.
+    """
+    bands = np.arange(min(order, reflection.order))
+    straight = int(np.argmax(reflection.views.directions[:, 2]))
+    heights = np.cos(np.linspace(0.0, np.pi, _PROFILE))
+    zonal = spherical_harmonics.evaluate(len(bands), hemisphere.meridian(heights))[:, bands * (bands + 1)]
+    profile = reflection.radiance[straight][bands * (bands + 1)].mean(axis=1)
+
+    def rings(strength: float) -> bool:
+        factors = spherical_harmonics.window(len(bands), "heat", strength)
+        shape = np.sum(zonal * (profile * factors), axis=1)
+        return bool(shape.min() < -DEEPEST_LOBE * shape.max())
+
+    if not rings(0.0):
+        return np.ones(order)
+    low, high = 0.0, _STRONGEST
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if rings(middle) else (low, middle)
+    return spherical_harmonics.window(order, "heat", high)
+
+
 @dataclass(frozen=True)
 class RowChoice:
     """How a material's highlight is held. kind: diffuse (none worth rows), glossy, mirror (left out: SH can't hold it).
