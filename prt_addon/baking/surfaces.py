@@ -112,8 +112,9 @@ def plan_surfaces(scene: SceneMesh, settings: BakeSettings) -> SurfacePlan:
             for number in np.unique(scene.material[target.points])}
     left_out: list[LeftOut] = []
     hints: list[str] = []
+    order = max(INCIDENT_ORDER, settings.order)
     reflections: dict[int, Reflection] = {
-        number: reflection_of_material(material, max(INCIDENT_ORDER, settings.order)) for number, material in enumerate(scene.materials)
+        number: reflection_of_material(material, order) for number, material in enumerate(scene.materials)
         if material.specular_level > 0.0 or material.metallic > 0.0}
     rows = {number: _rows(scene.materials[number], reflections[number], settings, left_out, hints)
             for number in sorted(used & reflections.keys())}
