@@ -36,7 +36,7 @@ from ..transport.gather import Gather, gather_operator
 from ..transport.glossy import GlossySurfaces, glossy_transfer, surface_frames
 from ..transport.hemisphere_visibility import HemisphereVisibility, VisibilityCoefficients
 from ..transport.hit_record import HitRecord
-from ..transport.incident_light import DiffuseRadiance, IndirectLight
+from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, IndirectLight, SumOfRadiances
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
@@ -49,6 +49,8 @@ from .translucency import BodyLight, light_through_bodies
 POLL_SECONDS = 0.05
 # Receivers whose layers leave less of the diffuse one than this say nothing about its error.
 LEAST_DIFFUSE = 0.05
+# Share of glossy surfaces among what glossy receivers see from which on their light is followed by its direction.
+LEAST_GLOSSY_HITS = 0.01
 
 
 @dataclass(frozen=True)
@@ -241,13 +243,19 @@ class _Bake:
         kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
         surfaces = GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
                                   np.searchsorted(used, scene.material[points]), kernels)
-        indirect = None
-        if gathered is not None and gathered.hits is not None:
-            albedo = self.albedo[receivers.key % len(scene.points)][:, None, :transfer.shape[2]]
-            source = DiffuseRadiance(gathered.hits, scene, receivers, albedo * transfer)
-            indirect = IndirectLight(gathered.hits, source, visibility.rows, visibility.blocked)
+        frames, order = surfaces.frames, self.plan.needs.order
+        indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
         found = yield from self._follow("glossy", glossy_transfer(
-            self.tracer, surfaces, self.plan.needs.order, visibility.visible, indirect))
+            self.tracer, surfaces, order, visibility.visible, indirect))
+        if indirect is not None and self._share_of_glossy_hits(gathered.hits) > LEAST_GLOSSY_HITS:
+            # Once more, with what was just found as the light that glossy surfaces send to each other. In the first
+            # round, and so from the second bounce on, they reflect as much, but evenly.
+            bounce = GlossyRadiance(gathered.hits, scene, receivers.key[visibility.rows], frames, found,
+                                    self.surfaces.functions)
+            albedo = self.surfaces.diffuse_albedo(scene)
+            indirect = self._indirect(gathered, receivers, transfer, visibility, albedo, bounce)
+            found = yield from self._follow("glossy", glossy_transfer(
+                self.tracer, surfaces, order, visibility.visible, indirect))
         windows = np.array([self.surfaces.parts[number].window[:found.shape[2]] for number in used], np.float32)
         if (windows < 1.0).any():
             found *= windows[surfaces.material][:, None, :, None]
@@ -255,6 +263,23 @@ class _Bake:
         rows[points] = found  # one channel serves all three
         self._save("glossy", {"rows": rows})
         return rows
+
+    def _indirect(self, gathered: Gather | None, receivers: ReceiverSet, transfer: NDArray[np.float32],
+                  visibility: VisibilityCoefficients, albedo: NDArray[np.float32], bounce: GlossyRadiance | None,
+                  ) -> IndirectLight | None:
+        """What glossy receivers get from surfaces: diffuse light of an albedo (p, 3) and a glossy bounce."""
+        if gathered is None or gathered.hits is None:
+            return None
+        channels = transfer.shape[2] if bounce is None else self.plan.needs.channels
+        albedo = albedo[receivers.key % len(self.scene.points)][:, None, :channels]
+        source = DiffuseRadiance(gathered.hits, self.scene, receivers, albedo * transfer)
+        return IndirectLight(gathered.hits, source if bounce is None else SumOfRadiances((source, bounce)),
+                             visibility.rows, visibility.blocked)
+
+    def _share_of_glossy_hits(self, hits: HitRecord) -> float:
+        """Which part of what glossy receivers see of surfaces is glossy itself."""
+        glossy = self.glossy[self.scene.triangles[hits.triangle]].any(axis=1) & hits.front
+        return float(np.mean(glossy)) if len(glossy) else 0.0
 
     def _subsurface(self, transfer: NDArray[np.float32]) -> Generator[Progress, None, list[BodyLight]]:
         """Light that travels through each object's translucent materials. transfer: (p, columns, channels)."""

@@ -95,6 +95,14 @@ class SurfacePlan:
         """Whether some highlight or subsurface light differs between channels."""
         return any((part.kernel is not None and part.kernel.shape[2] == 3) or part.translucent for part in self.parts)
 
+    def diffuse_albedo(self, scene: SceneMesh) -> NDArray[np.float32]:
+        """(p, 3) the diffuse part of what surfaces with rows of their own send back; for others the whole."""
+        whole = self.bounce_albedo(scene)
+        has_rows = np.array([part.kernel is not None for part in self.parts])
+        share = np.array([part.diffuse_share for part in self.parts], np.float32)
+        rows = self.glossy_points(scene) & has_rows[scene.material]
+        return np.where(rows[:, None], scene.albedo * share[scene.material, None], whole)
+
     def bounce_albedo(self, scene: SceneMesh) -> NDArray[np.float32]:
         """(p, 3) what surfaces send back of the light: the diffuse part and, spread evenly, the highlight."""
         if all(part.material.is_diffuse for part in self.parts):

@@ -130,6 +130,24 @@ class GlossyRadiance:
         return evaluate(self._order, local)[:, self._functions].astype(np.float32)
 
 
+@dataclass(frozen=True)
+class SumOfRadiances:
+    """Several sources at once, all of the same columns; those of one channel count for each of three."""
+
+    sources: tuple[SurfaceRadiance, ...]
+
+    @property
+    def values(self) -> int:
+        """Columns times channels, of the source with most channels."""
+        return max(source.values for source in self.sources)
+
+    def along(self, hits: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Exit radiance (h, values)."""
+        parts = [source.along(hits) for source in self.sources]
+        return sum(part if part.shape[1] == self.values else np.repeat(part, self.values // part.shape[1], axis=1)
+                   for part in parts)
+
+
 def padded_groups(starts: NDArray[np.int64], counts: NDArray[np.int64], at_once: int,
                   ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
     """Groups of contiguous items (starts, counts) in sets of equal padded length, at most `at_once` to a set.
