@@ -4,13 +4,14 @@
     python benchmarks/glossy.py [--rows 24] [--light-order 5] [--indirect] [--write signal.npy]
 
 The material is a Phong lobe (isotropic, --rows 16 or 25) or a lobe stretched along the tangent (24 rows without l=1,
-m=0), fitted by quadrature. The signal is (points, rows * columns), in the order of the mesh's vertices.
+m=0), fitted by quadrature. The signal is (points, rows * columns * channels), in the order of the mesh's vertices.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import time
 from collections.abc import Generator
 from typing import Any
@@ -80,16 +81,19 @@ def main() -> None:
     parser.add_argument("--directions", type=int, default=1024)
     parser.add_argument("--gather-directions", type=int, default=128)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--channels", type=int, default=1, choices=(1, 3))
     parser.add_argument("--indirect", action="store_true", help="diffuse bounces into the glossy rows, a glossy bounce")
     parser.add_argument("--compare", action="store_true", help="also the diffuse transfer alone, before and after")
-    parser.add_argument("--write", help="write the glossy signal (points, rows * columns) as .npy")
+    parser.add_argument("--write", help="write the glossy signal (points, rows * columns * channels) as .npy")
     arguments = parser.parse_args()
     positions, triangles = load_obj(mesh_path(arguments.mesh))
     scene = SceneMesh.assemble([smooth_object("mesh", positions, triangles, (ALBEDO,) * 3)])
     clock = Clock()
     matrices, receivers = fill(scene, arguments, clock)
     print_table(["stage", "seconds"], clock.rows)
-    print(f"{len(receivers)} receivers, {matrices.shape[1]} x {matrices.shape[2]}, {matrices.nbytes / 1e6:.0f} MB")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    print(f"{len(receivers)} receivers, {' x '.join(map(str, matrices.shape[1:]))}, {matrices.nbytes / 1e6:.0f} MB; "
+          f"peak memory of the process {peak:.0f} MB")
     if arguments.write:
         front = receivers.key < len(scene.points)
         signal = np.zeros((len(scene.points), matrices[0].size), np.float32)
@@ -99,7 +103,7 @@ def main() -> None:
 
 
 def fill(scene: SceneMesh, arguments: argparse.Namespace, clock: Clock) -> tuple[np.ndarray, ReceiverSet]:
-    """All stages; the glossy matrices (g, rows, columns, 1) and their receivers."""
+    """All stages; the glossy matrices (g, rows, columns, channels) and their receivers."""
     order, incident = arguments.light_order, arguments.incident_order
     tracer = Tracer(scene.points, scene.triangles, arguments.threads)
     keys = np.flatnonzero(~scene.loose)
@@ -121,27 +125,29 @@ def fill(scene: SceneMesh, arguments: argparse.Namespace, clock: Clock) -> tuple
     started = time.perf_counter()
     visibility = plain.result(receivers.normals)
     tangents = np.cross((0.0, 0.0, 1.0), receivers.normals)
-    kernel = lobe_kernel(functions, incident, 2.0 if arguments.rows == 24 else 1.0)
+    colours = np.array([1.0, 0.8, 0.5])[:arguments.channels]
+    kernel = lobe_kernel(functions, incident, 2.0 if arguments.rows == 24 else 1.0) * colours
     frames = surface_frames(receivers.normals, tangents)
     surfaces = GlossySurfaces(frames, np.zeros(len(receivers), np.int64), (kernel,))
     clock.rows.append(["coefficients, frames, kernel", time.perf_counter() - started])
     if gathered is None:
         return clock.run("glossy matrices", glossy_transfer(tracer, surfaces, order, visibility.visible)), receivers
-    albedo = np.full((len(receivers), 1), ALBEDO, np.float32)
+    albedo = np.full((len(receivers), arguments.channels), ALBEDO, np.float32)
     bounced = clock.run("diffuse bounces", interreflect(gathered.matrix, albedo, direct, 1e-3)).transfer
     record = gathered.hits
     print(f"{len(record.triangle)} hits, {sum(a.nbytes for a in vars(record).values()) / 1e6:.0f} MB")
-    source = DiffuseRadiance(record, scene, receivers, bounced * albedo[:, None])
+    source = DiffuseRadiance(record, scene, receivers, bounced * albedo[:, None, :])
     indirect = IndirectLight(record, source, visibility.rows, visibility.blocked)
     matrices = clock.run("glossy matrices, diffuse bounces in",
                          glossy_transfer(tracer, surfaces, order, visibility.visible, indirect))
     glossy = GlossyRadiance(record, scene, receivers.key, surfaces.frames, matrices, functions)
     second = IndirectLight(record, glossy, visibility.rows, visibility.blocked)
-    diffuse = np.empty((len(matrices), order ** 2), np.float32)
+    diffuse = np.empty((len(matrices), order ** 2 * arguments.channels), np.float32)
     added = clock.run("glossy bounce", glossy_transfer(tracer, surfaces, order, None, second, diffuse=diffuse))
-    size = [float(np.sqrt(np.mean(np.square(a, dtype=np.float64)))) for a in (matrices, added)]
+    size = [float(np.sqrt(np.mean(np.square(a[::16], dtype=np.float64)))) for a in (matrices, added)]
     print(f"RMS of the matrices {size[0]:.4g}, of the glossy bounce {size[1]:.4g}")
-    return matrices + added, receivers
+    matrices += added
+    return matrices, receivers
 
 
 if __name__ == "__main__":

@@ -21,9 +21,9 @@ from ..scene.scene_mesh import SceneMesh
 from .hit_record import HitRecord
 from .receiver_set import ReceiverSet
 
-# Receivers, and numbers in the largest temporary array (64 MB in single precision), of one block.
+# Receivers, and numbers in the largest temporary array (32 MB in single precision), of one block.
 BLOCK = 1024
-NUMBERS = 1 << 24
+NUMBERS = 1 << 23
 # Items of a group are padded to a multiple of this with zeros, so that groups of equal length are multiplied at once.
 PADDING = 4
 
