@@ -119,7 +119,8 @@ class Medium:
     def poles(self, channel: int, size: float) -> Poles:
         """What R_d takes of a channel, lengths in units of `size` (metres) and not below SHALLOWEST."""
         x, depth = float(self.x[channel]), max(float(self.depth[channel]) / size, SHALLOWEST)
-        return Poles(max(1.0 - x * x / 3.0, 0.0), depth, depth * (1.0 + 4.0 / 3.0 * self.boundary), x / depth)
+        alpha = 0.0 if x >= LARGEST_X else 1.0 - x * x / 3.0
+        return Poles(alpha, depth, depth * (1.0 + 4.0 / 3.0 * self.boundary), x / depth)
 
 
 class Poles(NamedTuple):
