@@ -34,9 +34,10 @@ from ..linear_algebra import sparse_multiply
 from .dipole import Medium, disc_integral
 from .throughput import GROUP, Links, Places, fully_linked, linked
 
-# Error that one node may make, relative to the half-space's R, if light changed its sign from sample to sample. Errors
-# of nodes mostly cancel: the measured error of the transfer is a tenth of this (benchmarks/subsurface.py).
-TOLERANCE = 0.04
+# Error that one node may make, relative to the half-space's R (less for a body smaller than the mean free path), if
+# light changed its sign from sample to sample. Errors of nodes mostly cancel: the measured error of the whole transfer
+# is less than this (benchmarks/subsurface.py), and more tolerance saves little time.
+TOLERANCE = 0.01
 # Groups of places linked at once, and rows of full sums: some 1e5 links, whose numbers stay in the cache.
 GROUPS_AT_ONCE = 128
 ROWS_IN_FULL = 8

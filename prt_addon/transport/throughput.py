@@ -23,7 +23,6 @@ from .dipole import (
     diffuse_reflectance,
     disc_integral,
     mean_reflectance,
-    plane_integral,
     slope_and_curvature,
 )
 from .sample_tree import COLUMNS, ROWS, SampleTree
@@ -179,9 +178,8 @@ def _judged(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], t
     for index, poles in enumerate(places.kernels):
         slope, curvature = slope_and_curvature(poles, nearest)
         error[index] = area * (slope * spread + 0.5 * curvature * variance)
-        # A body far smaller than the depth returns far less than R, at most its area times R_d(0).
-        most = float(diffuse_reflectance(poles, np.zeros(1))[0]) * whole
-        enough &= error[index] <= tolerance * min(plane_integral(poles), most)
+        # No surface of this area gives more than a disc of it, which is R unless the body is smaller than the depth.
+        enough &= error[index] <= tolerance * float(disc_integral(poles, whole / np.pi))
     return enough, error
 
 

@@ -273,22 +273,16 @@ def test_an_open_mesh_loses_light_only():
 
 # The operator.
 
-def plain_sum(points, areas, light, poles):
-    """The double sum, a receiver's own disc in closed form."""
-    squared = np.sum((points[:, None] - points[None]) ** 2, axis=2)
-    kernel = diffuse_reflectance(poles, squared) * areas
-    np.fill_diagonal(kernel, disc_integral(poles, areas / np.pi))
-    return kernel @ light
-
-
-@pytest.mark.parametrize("path", [0.1, 0.5])
-def test_the_hierarchy_is_the_plain_double_sum(path):
-    points, normals, areas = ball(3)
-    light, medium = smooth_light(points), medium_of(path=path)
-    result = solve((points, normals, areas), light, medium, tolerance=0.01)
+@pytest.mark.parametrize("path", [0.2, 0.6])
+def test_the_hierarchy_is_the_plain_double_sum_over_a_finer_mesh(path):
+    # Four samples for each of ours: a plain sum of points is right there, since R_d is smooth at their spacing.
+    body, (points, _, areas) = ball(4), ball(5)
+    medium, checked = medium_of(path=path), np.arange(0, len(body[0]), 20)
+    result = solve(body, smooth_light(body[0]), medium, tolerance=0.003).transfer[checked]
+    squared = np.sum((body[0][checked, None] - points) ** 2, axis=2)
     for channel in range(3):
-        expected = plain_sum(points, areas, light, medium.poles(channel, 1.0))
-        assert np.abs(result.transfer[:, :, channel] - expected).max() < 0.01 * np.abs(expected).max()
+        expected = (diffuse_reflectance(medium.poles(channel, 1.0), squared) * areas) @ smooth_light(points)
+        assert np.abs(result[:, :, channel] - expected).max() < 0.01 * np.abs(expected).max()
 
 
 def test_a_smaller_tolerance_means_a_smaller_error():
@@ -330,7 +324,8 @@ def test_colours_are_three_greys():
     coloured = solve(body, light, medium_of(COLOUR, paths), tolerance=0.0)
     for channel in range(3):
         grey = solve(body, light[:, :, channel], medium_of(COLOUR[channel], paths[channel]), tolerance=0.0)
-        assert np.abs(grey.transfer - coloured.transfer[:, :, channel, None]).max() < 1e-5
+        # Which discs count as near is one decision for all channels.
+        assert np.abs(grey.transfer - coloured.transfer[:, :, channel, None]).max() < 2e-4
 
 
 def test_threads_and_order_do_not_matter():
