@@ -16,8 +16,9 @@ Energy. R_d is scaled so that a half-space returns its reflectance R, that is: F
 normalised (what is thrown back outside belongs to the material's highlight). R_d knows distance only, so a thin sheet
 gets its reflectance twice, once from each side. Two times R is right below 1 (a thin sheet absorbs less than a
 half-space), and impossible above: rows whose sum exceeds 1 are scaled by s_i s_j, which keeps R_d symmetric
-(reciprocity), to at most 1. Nothing is scaled up: what leaves a small or thin body by its sides is lost in the dipole,
-and reported as its energy.
+(reciprocity), and then, where neighbours differ, the row alone to at most 1. Folds that face each other across air are
+linked like a sheet's sides: the Buddha returns more than its colour for that. Nothing is scaled up: what leaves a small
+body by its sides is lost in the dipole. Both show in the reported energy.
 """
 
 from __future__ import annotations

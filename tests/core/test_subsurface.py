@@ -107,7 +107,7 @@ def test_internal_reflectance_is_near_the_fresnel_integral(ior):
         return cosine * (parallel**2 + across**2)
 
     expected = integrate.quad(fresnel, 0.0, 1.0, points=[np.sqrt(1.0 - 1.0 / ior**2)])[0]
-    assert internal_reflectance(ior) == pytest.approx(expected, abs=0.015)
+    assert internal_reflectance(ior) == pytest.approx(expected, abs=0.002)
 
 
 def test_means_are_right_to_second_order():
