@@ -118,6 +118,7 @@ class _Bake:
             with self.timer.stage("interreflection"):
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
+        self.receivers = receivers
         glossy, subsurface = None, []
         if visibility is not None:
             with self.timer.stage("glossy"):
@@ -345,8 +346,9 @@ class _Bake:
 
     def _fill_buried(self, transfer: NDArray[np.float32], signals: dict[str, NDArray[np.float32]]) -> None:
         """Replace what lies inside other bodies, and keep it out of the error budget: nobody sees it."""
-        white = transfer[self.keys, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
-        buried = buried_receivers(self.tracer, self.scene, self.keys, white)
+        receivers = self.receivers.taken(np.flatnonzero(np.isin(self.receivers.key, self.keys)))
+        white = transfer[receivers.key, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
+        buried = buried_receivers(self.tracer, self.scene, receivers, white)
         self.filled = 0
         for target in self.targets:
             place = target.points

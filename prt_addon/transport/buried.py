@@ -29,17 +29,19 @@ DIRECTIONS = 128
 RINGS = 2
 
 
-def buried_receivers(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], white: NDArray[np.floating],
+def buried_receivers(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, white: NDArray[np.floating],
                      ) -> NDArray[np.int64]:
-    """Those of the receivers `keys` that lie inside a body. white: (k,) their radiance in a white unit environment."""
-    dark = keys[white < DARK]
-    if not len(dark):
-        return dark
-    receivers = ReceiverSet.of_keys(scene, tracer, dark)
+    """Keys of those receivers that lie inside a body, sorted. white: (r,) their radiance in a white unit environment.
+    """
+    receivers = receivers.taken(np.flatnonzero(white < DARK))
+    if not len(receivers):
+        return receivers.key
     directions = quadrature(DIRECTIONS, 2)[0].astype(np.float32)
     cosines = facing_cosines(directions, receivers.normals)
     covered = np.zeros(len(receivers))
-    owner, reach = _objects_of_triangles(scene), NEAR * _longest_edges(scene) / tracer.diagonal
+    several = len(scene.objects) > 1  # one object alone touches nothing
+    owner = _objects_of_triangles(scene)
+    reach = NEAR * _longest_edges(scene) / tracer.diagonal if several else np.zeros(len(scene.points))
     point = receivers.key % len(scene.points)
     own = _objects_of_points(scene)[point]
     for index, direction in enumerate(directions):

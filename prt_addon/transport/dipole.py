@@ -29,8 +29,8 @@ LARGEST_X = np.sqrt(3.0)
 
 
 def internal_reflectance(ior: float) -> float:
-    """F_dr, the share of diffuse light inside that the boundary reflects back (Egan & Hilgeman's fit, Jensen 2001;
-    within 0.005 of the integral for 1..2; the fit's -0.002..0.002 at 1 is set to its known value 0)."""
+    """F_dr, the share of diffuse light inside that the boundary reflects back: Egan & Hilgeman's fit as Jensen 2001
+    gives it, within 0.002 of the Fresnel integral for 1..2; exactly 0 at 1, where the fit says 0.0016."""
     if ior == 1.0:
         return 0.0
     if ior < 1.0:
@@ -119,7 +119,8 @@ class Medium:
     def poles(self, channel: int, size: float) -> Poles:
         """What R_d takes of a channel, lengths in units of `size` (metres) and not below SHALLOWEST."""
         x, depth = float(self.x[channel]), max(float(self.depth[channel]) / size, SHALLOWEST)
-        return Poles(max(1.0 - x * x / 3.0, 0.0), depth, depth * (1.0 + 4.0 / 3.0 * self.boundary), x / depth)
+        alpha = 0.0 if x >= LARGEST_X else 1.0 - x * x / 3.0
+        return Poles(alpha, depth, depth * (1.0 + 4.0 / 3.0 * self.boundary), x / depth)
 
 
 class Poles(NamedTuple):

@@ -16,8 +16,9 @@ Energy. R_d is scaled so that a half-space returns its reflectance R, that is: F
 normalised (what is thrown back outside belongs to the material's highlight). R_d knows distance only, so a thin sheet
 gets its reflectance twice, once from each side. Two times R is right below 1 (a thin sheet absorbs less than a
 half-space), and impossible above: rows whose sum exceeds 1 are scaled by s_i s_j, which keeps R_d symmetric
-(reciprocity), to at most 1. Nothing is scaled up: what leaves a small or thin body by its sides is lost in the dipole,
-and reported as its energy.
+(reciprocity), and then, where neighbours differ, the row alone to at most 1. Folds that face each other across air are
+linked like a sheet's sides: the Buddha returns more than its colour for that. Nothing is scaled up: what leaves a small
+body by its sides is lost in the dipole. Both show in the reported energy.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ from ..linear_algebra import sparse_multiply
 from .dipole import Medium, disc_integral
 from .throughput import GROUP, Links, Places, fully_linked, linked
 
-# Error that one node may make, relative to the half-space's R, if light changed its sign from sample to sample. Errors
-# of nodes mostly cancel: the measured error of the transfer is a third of this (benchmarks/subsurface.py).
-TOLERANCE = 0.02
+# Error that one node may make, relative to the half-space's R (less for a body smaller than the mean free path), if
+# light changed its sign from sample to sample. Errors of nodes mostly cancel: the measured error of the whole transfer
+# is less than this (benchmarks/subsurface.py), and more tolerance saves little time.
+TOLERANCE = 0.01
 # Groups of places linked at once, and rows of full sums: some 1e5 links, whose numbers stay in the cache.
 GROUPS_AT_ONCE = 128
 ROWS_IN_FULL = 8

@@ -23,13 +23,12 @@ from .dipole import (
     diffuse_reflectance,
     disc_integral,
     mean_reflectance,
-    plane_integral,
     slope_and_curvature,
 )
 from .sample_tree import COLUMNS, ROWS, SampleTree
 
 # Places that share their list of nodes.
-GROUP = 16
+GROUP = 32
 # Discs whose radius is more than this share of their distance (depth included) are integrated; beyond, R_d's mean to
 # second order is within (225/192) (1/3)^4 = 1.5 % of the disc's (R_d falling as r^-3).
 NEAR = 1.0 / 3.0
@@ -163,15 +162,15 @@ def _judged(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], t
     |y - centre| (mean at most s) times R_d's steepest slope, and the second-order term adds at most half the largest
     curvature times s^2; times the node's area this bounds the error for any light of at most 1. Every node is allowed
     the same, so that a link more buys about as much wherever it is added: small nodes near the place, one for the
-    whole body where light no longer reaches. (On the Buddha half the links of a share of what each node gives, and of
-    Jensen & Buhler's solid angle, at the same error: benchmarks/subsurface.py.)
+    whole body where light no longer reaches. (On the Buddha half the links of allowing a share of what each node
+    gives, at the same error.)
     """
     tree, number = places.tree, len(places.tree.points)
     apart = tree.centre[node] - tree.centre[group]
     distance = np.sqrt(np.sum(apart * apart, axis=1))
     nearest = np.maximum(distance - tree.reach[group] - tree.extent[node], 0.0)
     variance, area = np.sum(tree.covariance[node, :3], axis=1), places.sizes[number + node]
-    spread = np.sqrt(variance)
+    spread, whole = np.sqrt(variance), tree.areas.sum()
     # A place's own disc is a matter of the receiver (subsurface.py), so no node that holds one of the group is taken.
     enough = (tree.first[node] >= tree.first[group] + tree.count[group]) | (
         tree.first[group] >= tree.first[node] + tree.count[node])
@@ -179,9 +178,8 @@ def _judged(places: Places, group: NDArray[np.int64], node: NDArray[np.int64], t
     for index, poles in enumerate(places.kernels):
         slope, curvature = slope_and_curvature(poles, nearest)
         error[index] = area * (slope * spread + 0.5 * curvature * variance)
-        # A body far smaller than the depth returns far less than R, at most its area times R_d(0).
-        most = float(diffuse_reflectance(poles, np.zeros(1))[0]) * places.sizes[number]
-        enough &= error[index] <= tolerance * min(plane_integral(poles), most)
+        # No surface of this area gives more than a disc of it, which is R unless the body is smaller than the depth.
+        enough &= error[index] <= tolerance * float(disc_integral(poles, whole / np.pi))
     return enough, error
 
 
