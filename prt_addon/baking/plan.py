@@ -23,6 +23,9 @@ SECONDS_PER_SUBSURFACE_VALUE = 2e-6
 BYTES_PER_RAY_HIT = 24
 # Smaller clusters cost more in bases, and in constants at each light change, than their points save.
 RECEIVERS_PER_CLUSTER = 24
+# Of matrices (highlights): receivers for each one in a basis, so that what is stored shrinks to half at most, and bytes
+# of an object's bases.
+RECEIVERS_PER_MATRIX, MOST_BASES = 2, 1 << 26
 # The part of a hemisphere that shows surfaces, before anything is traced: between an open statue and a room.
 TYPICAL_HIT_SHARE = 0.5
 
@@ -81,6 +84,10 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
 
 
 
-def most_clusters(asked: int, receivers: int) -> int:
-    """Clusters that an object of so many receivers may have."""
-    return max(1, min(asked, -(-receivers // RECEIVERS_PER_CLUSTER)))
+def most_clusters(settings: BakeSettings, receivers: int, shape: tuple[int, int, int]) -> int:
+    """Clusters that an object of so many receivers may have; shape: of its matrices, (rows, columns, channels)."""
+    most = -(-receivers // RECEIVERS_PER_CLUSTER)
+    if shape[0] > 1:  # there the bases are nearly all that is stored
+        matrices = min(receivers // RECEIVERS_PER_MATRIX, MOST_BASES // (4 * shape[0] * shape[1] * shape[2]))
+        most = min(most, matrices // (settings.vectors + 1))
+    return max(1, min(settings.clusters, most))

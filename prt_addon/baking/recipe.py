@@ -369,9 +369,11 @@ class _Bake:
             signal = (signal if solid.all() else signal[solid]).reshape(int(solid.sum()), -1)
             metric = row_metric(self.surfaces.functions_of_object(self.scene, target),
                                 self.scene.albedo[target.points][solid])
+            settings = self._encoder_settings(len(signal), self.shapes[target.name])
             state = _EncodeState()
+            yield self._progress("encode", number / len(targets))
             with ThreadPoolExecutor(1) as pool:
-                future = pool.submit(encode, signal, self._encoder_settings(len(signal)), metric, state.report)
+                future = pool.submit(encode, signal, settings, metric, state.report)
                 try:
                     while True:
                         try:
@@ -383,10 +385,10 @@ class _Bake:
                     state.cancelled = True
         return encodings
 
-    def _encoder_settings(self, receivers: int) -> EncoderSettings:
+    def _encoder_settings(self, receivers: int, shape: tuple[int, int, int]) -> EncoderSettings:
         settings = self.settings
         target = settings.compression_error ** 2 if settings.compression_error > 0.0 else None
-        clusters = most_clusters(settings.clusters, receivers)
+        clusters = most_clusters(settings, receivers, shape)
         return EncoderSettings(clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
                                vectors_limit=24 if settings.encoder == "adaptive" else None)
 

@@ -178,7 +178,9 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
                              f"backs fill {gathered.back_share:.2%} of the mean receiver's hemisphere",
                              "a second receiver at each point seen from behind"))
     for name, encoding in encodings.items():
-        used, most = len(encoding.vectors_per_cluster), most_clusters(settings.clusters, len(encoding.cluster))
+        columns, channels = plan.needs.order ** 2, plan.needs.channels
+        shape = (encoding.bases.shape[2] // (columns * channels), columns, channels)
+        used, most = len(encoding.vectors_per_cluster), most_clusters(settings, len(encoding.cluster), shape)
         if encoding.adaptive_left_out:
             found.append(LeftOut(f"the adaptive pass for {name}", "its clusters' errors are even",
                                  "redistributing vectors among clusters"))
