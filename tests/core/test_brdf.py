@@ -395,3 +395,36 @@ def test_results_do_not_depend_on_the_blocks(monkeypatch: pytest.MonkeyPatch) ->
     first = whole()
     monkeypatch.setattr(brdf, "_BLOCK", 5000)
     np.testing.assert_allclose(whole(), first, rtol=0, atol=1e-12 * np.abs(first).max())
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.35, 0.5])
+def test_a_windowed_highlight_has_no_dark_rings(roughness):
+    """A small bright light seen in the highlight along the normal, all around the hemisphere: nowhere below nought."""
+    material = SurfaceMaterial("metal", (1.0, 1.0, 1.0), roughness, 1.0, specular_level=0.5)
+    order = 5
+    reflection = brdf.reflection_of_material(material, order)
+    bands = brdf.ringing_window(reflection, order)
+    assert bands[0] == 1.0 and (np.diff(bands) <= 0.0).all()
+    straight = int(np.argmax(reflection.views.directions[:, 2]))
+    angles = np.linspace(0.0, np.pi, 400)
+    lights = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], axis=1)
+    shown = sh.evaluate(order, lights) * reflection.radiance[straight, :, 0]
+    plain, windowed = shown.sum(axis=1), (shown * sh.expand_bands(bands)).sum(axis=1)
+    assert windowed.min() > -0.031 * windowed.max()
+    assert plain.min() < -0.031 * plain.max() or bands[-1] == 1.0
+
+
+def test_a_rough_highlight_needs_no_window():
+    material = SurfaceMaterial("metal", (1.0, 1.0, 1.0), 1.0, 1.0, specular_level=0.5)
+    np.testing.assert_array_equal(brdf.ringing_window(brdf.reflection_of_material(material, 7), 7), np.ones(7))
+
+
+def test_white_surroundings_are_reflected_exactly_whatever_is_cut_from_the_incident_side():
+    material = SurfaceMaterial("metal", (1.0, 1.0, 1.0), 0.3, 1.0, specular_level=0.5)
+    reflection, functions = brdf.reflection_of_material(material, 7), hemisphere.functions_of(24)
+    matrix = brdf.reflection_matrix(reflection, functions, smallest_incident=0.1)
+    integrals = hemisphere.gram_matrix(np.arange(49))[0] * np.sqrt(4 * np.pi)  # of unit radiance over H
+    z = np.linspace(0.05, 1.0, 20)
+    views = hemisphere.evaluate(functions, hemisphere.meridian(z))
+    radiance = views @ (matrix[:, :, 0] @ integrals)
+    np.testing.assert_allclose(radiance, 1.0, atol=0.01)
