@@ -53,6 +53,10 @@ def load(name: str) -> bpy.types.Object:
     importer(filepath=str(mesh_path(name)))
     thing = bpy.context.selected_objects[0]
     bpy.context.view_layer.objects.active = thing
+    bpy.ops.object.mode_set(mode="EDIT")  # the horse is wound inwards, and Cycles takes it at its word
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.normals_make_consistent(inside=False)
+    bpy.ops.object.mode_set(mode="OBJECT")
     bpy.ops.object.shade_smooth()
     thing.data.materials.clear()
     thing.data.materials.append(diffuse_material("Diffuse", ALBEDO))

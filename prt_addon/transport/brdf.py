@@ -237,8 +237,8 @@ ENOUGH = 0.99
 ROW_COUNTS = (1, 4, 9, 16, 24, 25)
 
 
-# Negative lobe, relative to the peak, that a highlight may keep: about what the clamped cosine of diffuse light has, where
-# nobody sees it.
+# Negative lobe, relative to the peak, that a highlight may keep: about what the clamped cosine of diffuse light has,
+# where nobody sees it.
 DEEPEST_LOBE = 0.03
 _PROFILE, _HALVINGS, _STRONGEST = 181, 24, 1.0
 

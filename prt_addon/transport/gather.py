@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..linear_algebra import multiply
+from ..scene.receivers import adjacent_faces
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Hits, Tracer
 from .hit_record import HitRecord, HitRecorder, KeptHits
@@ -52,13 +53,14 @@ class Gather:
 @dataclass(frozen=True)
 class _Task:
     """first: the number of the first direction in the block's; solid_angles: (d,) the quadrature's weights; weights:
-    (d, b) the same, normalised for each receiver; wanted: (b,) bool, whose hits are kept (None: nobody's)."""
+    (d, b) the same, normalised for each receiver; face_shares: of the scene; wanted: (b,) bool, whose hits are kept (None: nobody's)."""
 
     block: Block
     first: int
     directions: NDArray[np.float32]
     solid_angles: NDArray[np.float64]
     weights: NDArray[np.float32]
+    face_shares: NDArray[np.float32]
     wanted: NDArray[np.bool_] | None
     last_of_block: bool
 
@@ -138,7 +140,7 @@ def _trace(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, directions:
         return _hits(tracer, scene, receivers, task)
 
     wanted = None if recorder is None else recorder.wanted[receivers.key]
-    tasks = _tasks(receivers, directions, weights, group, seed, wanted)
+    tasks = _tasks(receivers, directions, weights, group, seed, face_shares(scene), wanted)
     for task, (found, rays) in tracer.map_in_order(trace, tasks):
         entries.row += found.row
         entries.key += found.key
@@ -158,8 +160,26 @@ def _trace(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, directions:
     return sparse.vstack(finished, format="csr") if finished else sparse.csr_matrix((0, 2 * len(scene.points)))
 
 
+def face_shares(scene: SceneMesh) -> NDArray[np.float32]:
+    """(t, 3) what the surface at a triangle's corner sends back, over the mean of all triangles around that corner.
+
+    A receiver's transfer is the mean over its faces of what each one's own horizon leaves of the hemisphere about the
+    shading normal. What is seen of a rough surface is rather the faces that stand out, which their horizons hide less.
+    Of a hemisphere's cosine a horizon tilted by b leaves (1 + cos b) / 2 (a lune of the unit disc); the shares' mean
+    around a corner, weighted as the receiver weighs its faces, is 1. Without them all bounces on the Buddha lose 3 % of
+    their light.
+    """
+    corners = scene.points[scene.triangles]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
+    left = 0.5 * (1.0 + np.sum(scene.normals[scene.triangles] * face[:, None, :], axis=2))
+    faces, weights = adjacent_faces(scene.points, scene.triangles)
+    mean = np.sum(weights * 0.5 * (1.0 + np.sum(faces * scene.normals[:, None, :], axis=2)), axis=1)
+    return (left / np.maximum(mean, 1e-3)[scene.triangles]).astype(np.float32)
+
+
 def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDArray[np.float64], group: int,
-           seed: int, wanted: NDArray[np.bool_] | None) -> Iterator[_Task]:
+           seed: int, face_shares: NDArray[np.float32], wanted: NDArray[np.bool_] | None) -> Iterator[_Task]:
     for block in blocks(len(receivers), group, seed):
         turned = np.ascontiguousarray(rotated(directions, block.rotation), np.float32)
         # In double, for normalised rows: the sum over the hemisphere is the same whatever the chunk.
@@ -170,7 +190,8 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
         scale = (1.0 / np.maximum(cosines, np.finfo(np.float64).tiny)).astype(np.float32)
         for start in range(0, len(turned), CHUNK):
             chunk = slice(start, start + CHUNK)
-            yield _Task(block, start, turned[chunk], weights[chunk], weights[chunk, None].astype(np.float32) * scale,
+            yield _Task(block, start, turned[chunk], weights[chunk],
+                        weights[chunk, None].astype(np.float32) * scale, face_shares,
                         None if wanted is None else wanted[block.receivers], start + CHUNK >= len(turned))
 
 
@@ -194,6 +215,7 @@ def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task)
     corner = scene.triangles[hits.triangle[met]].astype(np.int64) + side[:, None]
     u, v = hits.u[met], hits.v[met]
     value = (np.stack([1.0 - u - v, u, v], axis=1) * share[:, None]).astype(np.float32)
+    value *= np.take(task.face_shares, hits.triangle[met], axis=0)
     kept = [] if task.wanted is None or not task.wanted.any() else _kept(task, hits, met, which, row, share, above)
     return _Entries([np.repeat(row, 3)], [corner.ravel()], [value.ravel()], kept), rays
 
