@@ -53,7 +53,8 @@ class Gather:
 @dataclass(frozen=True)
 class _Task:
     """first: the number of the first direction in the block's; solid_angles: (d,) the quadrature's weights; weights:
-    (d, b) the same, normalised for each receiver; face_shares: of the scene; wanted: (b,) bool, whose hits are kept (None: nobody's)."""
+    (d, b) the same, normalised for each receiver; face_shares: of the scene; wanted: (b,) bool, whose hits are kept
+    (None: nobody's)."""
 
     block: Block
     first: int
