@@ -25,6 +25,7 @@ from .render_data import (
     light_signature,
     make_render_data,
     matching_light,
+    plain_surface,
     texture_values,
     viewer_of,
 )
@@ -53,6 +54,7 @@ class ObjectDrawing:
         self._encoding = make_texture(data.encoding)
         self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
         self._colours: gpu.types.GPUTexture | None = None
+        self._plain_batch: gpu.types.GPUBatch | None = None  # for colours, one vertex per point
 
     def relight(self, constants: NDArray[np.float32]) -> None:
         """Compute every point's exit radiance from per-cluster constants (clusters, vectors + 1, rows, 3)."""
@@ -76,6 +78,8 @@ class ObjectDrawing:
     def show_colours(self, colours: NDArray[np.float32]) -> None:
         """Draw (points, 3) colours in place of computed radiances."""
         self._colours = make_texture(texture_values(colours))
+        if self.data.functions and self._plain_batch is None:
+            self._plain_batch = _make_batch(plain_surface(self.data))
 
     def exit_radiances(self) -> NDArray[np.float32]:
         """The exit radiances on the GPU for unit albedo, (points, rows, 3). Waits for the GPU: for tests and export."""
@@ -96,19 +100,21 @@ class ObjectDrawing:
             program.uniform_float("viewer", viewer_of(transform).tolist())
         program.uniform_float("exposure", exposure)
         program.uniform_float("albedo_share", 1.0 if use_albedo else 0.0)
-        self._batch.draw(program)
+        batch = self._batch if self._colours is None or self._plain_batch is None else self._plain_batch
+        batch.draw(program)
 
 
 def _make_batch(data: RenderData) -> gpu.types.GPUBatch:
-    """The mesh with its albedo, and its frames where the view counts, as an indexed batch; gl_VertexID is then the
-    point's number."""
+    """The mesh with its albedo, and its frames where the view counts, as an indexed batch; gl_VertexID is the point's
+    number where it does not."""
     attributes = {"position": data.positions, "albedo": data.albedo}
     if data.functions:
-        attributes |= {"normal": data.normals, "tangent": data.tangents}
+        numbers = np.stack([data.receivers, data.turns], axis=1).astype(np.float32)  # exact up to 2^24 points
+        attributes |= {"normal": data.normals, "tangent": data.tangents, "receiver_and_turn": numbers}
     layout = gpu.types.GPUVertFormat()
-    for name in attributes:
-        layout.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
-    vertices = gpu.types.GPUVertBuf(layout, data.points)
+    for name, values in attributes.items():
+        layout.attr_add(id=name, comp_type="F32", len=values.shape[1], fetch_mode="FLOAT")
+    vertices = gpu.types.GPUVertBuf(layout, len(data.positions))
     for name, values in attributes.items():
         vertices.attr_fill(name, values)
     return gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=gpu.types.GPUIndexBuf(type="TRIS", seq=data.triangles))

@@ -22,6 +22,35 @@ def fetch_rows(functions: tuple[int, ...]) -> str:
     return "\n".join(["void fetch_rows(int first_texel)", "{", *lines, "}", ""])
 
 
+def turns_with_frames(functions: tuple[int, ...]) -> bool:
+    """Whether the rows can be turned about the normal: with every function of azimuth m the set has its twin -m."""
+    return all(_twin(index) in functions for index in functions)
+
+
+def _twin(index: int) -> int:
+    """The function of the same band and azimuth -m."""
+    band = math.isqrt(index)
+    return 2 * band * (band + 1) - index
+
+
+def turn_rows(functions: tuple[int, ...]) -> str:
+    """`void turn_rows(float turn)` of the vertex stage: the varyings as coefficients in a frame that is turned by the
+    angle about the normal. cos(m a) and sin(m a) of an azimuth a = a' + turn are sums of those of a'."""
+    lines, azimuths = [], set()
+    for name, index in zip(row_names(functions), functions, strict=True):
+        band = math.isqrt(index)
+        m = index - band * (band + 1)
+        if m <= 0:
+            continue
+        if m not in azimuths:
+            azimuths.add(m)
+            lines += [f"  float cos_{m} = cos({m}.0 * turn);", f"  float sin_{m} = sin({m}.0 * turn);"]
+        twin = row_names(functions)[functions.index(_twin(index))]
+        lines += [f"  vec3 old_{index} = {name};", f"  {name} = old_{index} * cos_{m} + {twin} * sin_{m};",
+                  f"  {twin} = {twin} * cos_{m} - old_{index} * sin_{m};"]
+    return "\n".join(["void turn_rows(float turn)", "{", *lines, "}", ""])
+
+
 def sum_rows(functions: tuple[int, ...]) -> str:
     """`vec3 sum_rows(vec3 view)` of the fragment stage: the sum of y_i(view) times row, for a unit view."""
     order = math.isqrt(max(functions)) + 1

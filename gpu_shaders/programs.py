@@ -87,6 +87,7 @@ def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     info.define("ROWS", str(len(functions) + 1))
     for slot, name in enumerate(("position", "albedo", "normal", "tangent")):
         info.vertex_in(slot, "VEC3", name)
+    info.vertex_in(4, "VEC2", "receiver_and_turn")
     info.vertex_out(varyings)
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.sampler(0, "FLOAT_2D", "exit_values")
@@ -97,7 +98,8 @@ def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     info.push_constant("FLOAT", "exposure")
     info.push_constant("FLOAT", "albedo_share")
     fetch, total = hemisphere_glsl.fetch_rows(functions), hemisphere_glsl.sum_rows(functions)
-    info.vertex_source("\n".join([_source("texel_layout.glsl"), fetch, _source("view_surface.vert.glsl")]))
+    turn = hemisphere_glsl.turn_rows(functions)
+    info.vertex_source("\n".join([_source("texel_layout.glsl"), fetch, turn, _source("view_surface.vert.glsl")]))
     info.fragment_source("\n".join([total, _source("view_surface.frag.glsl")]))
     return gpu.shader.create_from_info(info)
 

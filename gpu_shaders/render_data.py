@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.errors import BadScene
+from . import hemisphere_glsl
 
 if TYPE_CHECKING:
     from ..prt_addon.storage.container import BakedTransfer
 
+# Turn of frames within a triangle, in radians, up to which blending across it shows nothing (functions turn by up to
+# four times as much).
+LARGEST_TURN = 0.05
 TEXTURE_WIDTH = 2048
 LARGEST_TEXTURE = 16384  # texels per side that OpenGL 4.3, Vulkan and Metal devices fit for Blender all offer
 DEPTH_BIAS = 1e-6  # NDC towards the viewer: wins against the original surface, loses to anything in front of it
@@ -50,12 +54,14 @@ class DrawItem:
 class RenderData:
     """The arrays of one baked object that do not depend on the light.
 
-    positions, albedo: (points, 3) float32, contiguous; triangles: (triangles, 3) int32;
+    points: receivers; positions, albedo: (vertices, 3) float32, contiguous, as many vertices as points where the view
+    does not count; triangles: (triangles, 3) int32 of vertices;
     encoding: (height, TEXTURE_WIDTH, 4) float32, see `encode`; cluster_vectors: (clusters,) int32, how many of the
     `vectors` each cluster really has (the rest are zero). functions: of the view, one for each row but the first;
-    normals, tangents: (points, 3) float32, None without functions.
+    normals, tangents: (vertices, 3) float32, receivers, turns: (vertices,), see `Corners`; None without functions.
     """
 
+    points: int
     positions: NDArray[np.float32]
     albedo: NDArray[np.float32]
     triangles: NDArray[np.int32]
@@ -68,10 +74,8 @@ class RenderData:
     functions: tuple[int, ...] = ()
     normals: NDArray[np.float32] | None = None
     tangents: NDArray[np.float32] | None = None
-
-    @property
-    def points(self) -> int:
-        return len(self.positions)
+    receivers: NDArray[np.int64] | None = None
+    turns: NDArray[np.float32] | None = None
 
     @property
     def exit_size(self) -> tuple[int, int]:
@@ -114,11 +118,13 @@ def encode(cluster: NDArray[np.integer], weights: NDArray[np.floating]) -> NDArr
 def make_render_data(baked: BakedTransfer) -> RenderData:
     """The arrays that the GPU needs of a baked object. Raises BadScene when they do not fit textures."""
     clusters, vectors_and_mean, rows, columns, _ = baked.bases.shape
-    seen = bool(baked.functions)
+    corners = shared_frames(baked) if baked.functions else None
+    place = slice(None) if corners is None else corners.receivers
     return RenderData(
-        positions=np.ascontiguousarray(baked.positions, np.float32),
-        albedo=np.ascontiguousarray(baked.albedo, np.float32),
-        triangles=np.ascontiguousarray(baked.triangles, np.int32),
+        points=len(baked.positions),
+        positions=np.ascontiguousarray(baked.positions[place], np.float32),
+        albedo=np.ascontiguousarray(baked.albedo[place], np.float32),
+        triangles=np.ascontiguousarray(baked.triangles if corners is None else corners.triangles, np.int32),
         encoding=encode(baked.cluster, baked.weights),
         clusters=clusters,
         vectors=vectors_and_mean - 1,
@@ -126,9 +132,66 @@ def make_render_data(baked: BakedTransfer) -> RenderData:
         columns=columns,
         cluster_vectors=used_vectors(baked.bases),
         functions=baked.functions,
-        normals=np.ascontiguousarray(baked.normals, np.float32) if seen else None,
-        tangents=np.ascontiguousarray(baked.tangents, np.float32) if seen else None,
+        normals=None if corners is None else np.ascontiguousarray(baked.normals[place], np.float32),
+        tangents=None if corners is None else corners.tangents,
+        receivers=None if corners is None else corners.receivers,
+        turns=None if corners is None else corners.turns,
     )
+
+
+def plain_surface(data: RenderData) -> RenderData:
+    """The same surface with one vertex per point and no frames, as colours that don't depend on the view need it."""
+    first = slice(0, data.points)
+    triangles = data.receivers[data.triangles].astype(np.int32)
+    return replace(data, positions=data.positions[first], albedo=data.albedo[first], triangles=triangles, functions=())
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Vertices to draw: receivers (v,) their numbers; turns (v,) float32, by how many radians about the normal the
+    frame to draw with is turned from the receiver's own; tangents (v, 3) float32 of that frame; triangles (t, 3)."""
+
+    receivers: NDArray[np.int64]
+    turns: NDArray[np.float32]
+    tangents: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+
+def shared_frames(baked: BakedTransfer) -> Corners:
+    """Frames in which the corners of each triangle agree.
+
+    Coefficients of functions of the view may only be blended in one frame. No field of tangents is smooth all over a
+    closed surface, so where the three of a triangle turn against each other by more than LARGEST_TURN, its second and
+    third corner become vertices of their own, in the first one's frame: the shader turns their coefficients, which is
+    exact, and blends like with like.
+    """
+    points, triangles = len(baked.positions), baked.triangles
+    receivers, turns = np.arange(points), np.zeros(points, np.float32)
+    tangents = np.asarray(baked.tangents, np.float32)
+    if not hemisphere_glsl.turns_with_frames(baked.functions) or not any(baked.functions):
+        return Corners(receivers, turns, tangents, triangles)
+    turn = np.stack([_turn_towards(baked, triangles[:, 0], triangles[:, k]) for k in (1, 2)], axis=1)
+    chosen = np.flatnonzero(np.abs(turn).max(axis=1, initial=0.0) > LARGEST_TURN)
+    corner = triangles[chosen, 1:].ravel()
+    angle = turn[chosen].ravel().astype(np.float32)
+    new_triangles = triangles.copy()
+    new_triangles[chosen, 1:] = (points + np.arange(len(corner))).reshape(-1, 2)
+    normals, own = baked.normals[corner], tangents[corner]
+    turned = np.cos(angle)[:, None] * own + np.sin(angle)[:, None] * np.cross(normals, own)
+    return Corners(np.concatenate([receivers, corner]), np.concatenate([turns, angle]),
+                   np.concatenate([tangents, turned.astype(np.float32)]), new_triangles)
+
+
+def _turn_towards(baked: BakedTransfer, first: NDArray[np.integer], corner: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Angles (t,) about their normals from the tangents of corners to the tangents of the first corners, carried over
+    by the smallest rotation that takes normal to normal."""
+    tangents, normals = np.asarray(baked.tangents, np.float64), np.asarray(baked.normals, np.float64)
+    source, target, wanted = normals[first], normals[corner], tangents[first]
+    # The part along the bisector's reflection: t - (t . n') / (1 + n . n') (n + n'); opposite normals have none.
+    cosine = np.maximum(1.0 + np.sum(source * target, axis=1), 1e-6)
+    carried = wanted - (np.sum(wanted * target, axis=1) / cosine)[:, None] * (source + target)
+    own = tangents[corner]
+    return np.arctan2(np.sum(carried * np.cross(target, own), axis=1), np.sum(carried * own, axis=1))
 
 
 def used_vectors(bases: NDArray[np.float32]) -> NDArray[np.int32]:

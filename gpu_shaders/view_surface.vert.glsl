@@ -1,12 +1,16 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// A baked surface whose radiance depends on the view: the point's rows are found by the vertex number, and its frame
-// turns the direction to the viewer, left unnormalised so that its interpolation stays exact along flat triangles.
+// A baked surface whose radiance depends on the view: the point's rows are found by its number, turned into the frame
+// that its triangle shares, and that frame turns the direction to the viewer, left unnormalised so that its
+// interpolation stays exact along flat triangles.
 // Without SEES_VIEWER the constant function is the only one (subsurface light).
 void main()
 {
-  int first_texel = gl_VertexID * ROWS;
+  int first_texel = int(receiver_and_turn.x + 0.5) * ROWS;
   diffuse_radiance = texelFetch(exit_values, texel(first_texel), 0).rgb;
   fetch_rows(first_texel);
+  if (receiver_and_turn.y != 0.0) {
+    turn_rows(receiver_and_turn.y);
+  }
   surface_albedo = albedo;
 #ifdef SEES_VIEWER
   vec3 to_viewer = viewer.xyz - viewer.w * position;

@@ -23,11 +23,12 @@ Colour = tuple[float, float, float]
 Shape = Callable[[bmesh.types.BMesh], object]
 
 WHITE, GREY = (0.62, 0.58, 0.53), (0.36, 0.35, 0.34)
-RED, TEAL, AMBER = (0.56, 0.05, 0.03), (0.01, 0.24, 0.27), (0.70, 0.27, 0.01)
+RED, TEAL, BRASS, WAX = (0.56, 0.05, 0.03), (0.01, 0.24, 0.27), (0.95, 0.65, 0.25), (0.80, 0.42, 0.22)
 
 
-def add_object(name: str, shape: Shape, colour: Colour, placed: Matrix, smooth: bool = False) -> bpy.types.Object:
-    """An object with a mesh that `shape` fills, a plain Principled material, and a place."""
+def add_object(name: str, shape: Shape, colour: Colour, placed: Matrix, smooth: bool = False,
+               **inputs: float | Colour) -> bpy.types.Object:
+    """An object with a mesh that `shape` fills, a Principled material with these inputs, and a place."""
     content = bmesh.new()
     shape(content)
     for face in content.faces:
@@ -38,7 +39,8 @@ def add_object(name: str, shape: Shape, colour: Colour, placed: Matrix, smooth: 
     material = bpy.data.materials.new(name)
     shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Base Color"].default_value = (*colour, 1.0)
-    shader.inputs["Roughness"].default_value = 1.0
+    for name_of_input, value in {"Roughness": 1.0, "Specular IOR Level": 0.0, **inputs}.items():
+        shader.inputs[name_of_input].default_value = value
     mesh.materials.append(material)
     created = bpy.data.objects.new(name, mesh)
     created.matrix_world = placed
@@ -88,8 +90,11 @@ def add_shapes() -> None:
     suzanne.modifiers.new("Subdivision", "SUBSURF").levels = 2
     add_object("Red wall", box((0.16, 2.3, 1.9), 20), RED, placed(-1.5, 0.25, 0.951, (0.0, 0.0, -8.0)))
     add_object("Teal pillar", pillar, TEAL, placed(1.7, 0.75, 0.751), smooth=True)
-    add_object("Amber ball", lambda m: bmesh.ops.create_icosphere(m, subdivisions=5, radius=0.38), AMBER,
-               placed(1.15, -0.75, 0.381), smooth=True)
+    add_object("Brass ball", lambda m: bmesh.ops.create_icosphere(m, subdivisions=5, radius=0.38), BRASS,
+               placed(1.15, -0.75, 0.381), smooth=True, Metallic=1.0, Roughness=0.4)
+    add_object("Wax ball", lambda m: bmesh.ops.create_icosphere(m, subdivisions=5, radius=0.3), WAX,
+               placed(-0.7, -1.15, 0.301), smooth=True,
+               **{"Subsurface Weight": 1.0, "Subsurface Scale": 1.0, "Subsurface Radius": (1.0, 0.4, 0.2)})
 
 
 def add_camera() -> None:

@@ -16,7 +16,8 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 
 # isort: split
 from prt.gpu_shaders import draw, hemisphere_glsl, offscreen, programs, render_data
-from prt.prt_addon.relighting.exit_radiance import combine_rows, hemisphere_values, local_views, view_radiance
+from prt.prt_addon.basis.spherical_harmonics import rotation
+from prt.prt_addon.relighting.exit_radiance import combine_rows, hemisphere_values, view_radiance
 
 SIZE = 90
 TOLERANCE = 2e-3  # of the brightest value
@@ -110,13 +111,40 @@ def oracle(baked: Any, light: np.ndarray, view_projection: np.ndarray, matrix: n
         projectors = np.eye(3) - spread[:, :, None] * spread[:, None] / np.sum(spread ** 2, axis=1)[:, None, None]
         eye = np.linalg.solve(projectors.sum(axis=0), np.einsum("nij,nj->i", projectors, start))
         to_viewer = to_baked[:3, :3] @ eye + to_baked[:3, 3] - baked.positions
-    local = local_views(to_viewer, baked.normals, baked.tangents)
 
     def mixed(values: np.ndarray) -> np.ndarray:
-        return np.einsum("nk,nk...->n...", weights, values[corners])
+        return np.einsum("nk,nk...->n...", weights, values)
 
+    turned, local = in_shared_frames(baked, rows, to_viewer, corners)
     values = hemisphere_values(baked.functions, mixed(local))
-    return combine_rows(mixed(rows), mixed(baked.albedo.astype(np.float64)), values), well_inside
+    return combine_rows(mixed(turned), mixed(baked.albedo[corners].astype(np.float64)), values), well_inside
+
+
+def in_shared_frames(baked: Any, rows: np.ndarray, to_viewer: np.ndarray, corners: np.ndarray,
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (n, 3, rows, 3) and local views (n, 3, 3) of triangles' corners (n, 3), all three in the first one's frame
+    where frames turn by more than LARGEST_TURN, by rotations and their matrices of spherical harmonics."""
+    order = int(np.sqrt(max(baked.functions))) + 1
+    turned, local = rows[corners].astype(np.float64), np.empty((*corners.shape, 3))
+    for pixel, triangle in enumerate(corners):
+        frames = [np.array([t, np.cross(n, t), n]) for t, n in zip(
+            baked.tangents[triangle].astype(np.float64), baked.normals[triangle].astype(np.float64), strict=True)]
+        turns = []
+        for frame in frames:
+            # The smallest rotation that takes the first normal to this one, then the angle in this one's plane.
+            axis, cosine = np.cross(frames[0][2], frame[2]), frames[0][2] @ frame[2]
+            skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+            carried = (np.eye(3) + skew + skew @ skew / (1 + cosine)) @ frames[0][0]
+            turns.append(np.arctan2(carried @ frame[1], carried @ frame[0]))
+        if max(np.abs(turns)) > render_data.LARGEST_TURN:
+            for corner, turn in enumerate(turns):
+                back = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+                frames[corner] = back @ frames[corner]
+                matrix = rotation(order, back)[np.ix_(baked.functions, baked.functions)]
+                turned[pixel, corner, 1:] = matrix @ turned[pixel, corner, 1:]
+        for corner, point in enumerate(triangle):
+            local[pixel, corner] = frames[corner] @ to_viewer[point]
+    return turned, local
 
 
 def compare(scene: bpy.types.Scene, baked: Any, light: np.ndarray, matrix: np.ndarray | None = None,
