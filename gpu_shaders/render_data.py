@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from ..prt_addon.storage.container import BakedTransfer
 
 # Turn of frames within a triangle, in radians, up to which blending across it shows nothing (functions turn by up to
-# four times as much).
-LARGEST_TURN = 0.05
+# four times as much), and the steps in which frames are turned beyond it.
+LARGEST_TURN, TURN_STEP = 0.2, 0.1
 TEXTURE_WIDTH = 2048
 LARGEST_TEXTURE = 16384  # texels per side that OpenGL 4.3, Vulkan and Metal devices fit for Blender all offer
 DEPTH_BIAS = 1e-6  # NDC towards the viewer: wins against the original surface, loses to anything in front of it
@@ -172,10 +172,15 @@ def shared_frames(baked: BakedTransfer) -> Corners:
         return Corners(receivers, turns, tangents, triangles)
     turn = np.stack([_turn_towards(baked, triangles[:, 0], triangles[:, k]) for k in (1, 2)], axis=1)
     chosen = np.flatnonzero(np.abs(turn).max(axis=1, initial=0.0) > LARGEST_TURN)
-    corner = triangles[chosen, 1:].ravel()
-    angle = turn[chosen].ravel().astype(np.float32)
+    # Corners of one receiver that turn by nearly as much share a vertex; those that hardly turn stay as they are.
+    steps = np.rint(turn[chosen] / TURN_STEP).astype(np.int64)
+    turns_on = steps.ravel() != 0
+    drawn = triangles[chosen, 1:].astype(np.int64).ravel()
+    key, place = np.unique(drawn[turns_on] * 2 ** 16 + steps.ravel()[turns_on] + 2 ** 15, return_inverse=True)
+    corner, angle = key // 2 ** 16, ((key % 2 ** 16 - 2 ** 15) * TURN_STEP).astype(np.float32)
+    drawn[turns_on] = points + place
     new_triangles = triangles.copy()
-    new_triangles[chosen, 1:] = (points + np.arange(len(corner))).reshape(-1, 2)
+    new_triangles[chosen, 1:] = drawn.reshape(-1, 2)
     normals, own = baked.normals[corner], tangents[corner]
     turned = np.cos(angle)[:, None] * own + np.sin(angle)[:, None] * np.cross(normals, own)
     return Corners(np.concatenate([receivers, corner]), np.concatenate([turns, angle]),

@@ -18,6 +18,9 @@ def use_cycles(samples: int) -> bpy.types.World:
     scene.cycles.samples = samples
     scene.cycles.use_adaptive_sampling = False
     scene.cycles.use_denoising = False
+    # Blender's defaults end diffuse light after four bounces and cut bright paths.
+    scene.cycles.max_bounces = scene.cycles.diffuse_bounces = scene.cycles.glossy_bounces = 64
+    scene.cycles.sample_clamp_indirect = 0.0
     scene.world = bpy.data.worlds.new("World")
     if scene.world.node_tree is None:
         scene.world.use_nodes = True

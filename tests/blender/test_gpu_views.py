@@ -115,7 +115,8 @@ def oracle(baked: Any, light: np.ndarray, view_projection: np.ndarray, matrix: n
     def mixed(values: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nk...->n...", weights, values)
 
-    turned, local = in_shared_frames(baked, rows, to_viewer, corners)
+    unique, place = np.unique(corners, axis=0, return_inverse=True)
+    turned, local = (values[place.ravel()] for values in in_shared_frames(baked, rows, to_viewer, unique))
     values = hemisphere_values(baked.functions, mixed(local))
     return combine_rows(mixed(turned), mixed(baked.albedo[corners].astype(np.float64)), values), well_inside
 
@@ -137,7 +138,8 @@ def in_shared_frames(baked: Any, rows: np.ndarray, to_viewer: np.ndarray, corner
             carried = (np.eye(3) + skew + skew @ skew / (1 + cosine)) @ frames[0][0]
             turns.append(np.arctan2(carried @ frame[1], carried @ frame[0]))
         if max(np.abs(turns)) > render_data.LARGEST_TURN:
-            for corner, turn in enumerate(turns):
+            for corner, exact in enumerate(turns):
+                turn = np.rint(exact / render_data.TURN_STEP) * render_data.TURN_STEP
                 back = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
                 frames[corner] = back @ frames[corner]
                 matrix = rotation(order, back)[np.ix_(baked.functions, baked.functions)]
