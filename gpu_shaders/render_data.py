@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # Turn of frames within a triangle, in radians, up to which blending across it shows nothing (functions turn by up to
 # four times as much), and the steps in which frames are turned beyond it.
-LARGEST_TURN, TURN_STEP = 0.2, 0.1
+LARGEST_TURN, TURN_STEP = 0.1, 0.05
 TEXTURE_WIDTH = 2048
 LARGEST_TEXTURE = 16384  # texels per side that OpenGL 4.3, Vulkan and Metal devices fit for Blender all offer
 DEPTH_BIAS = 1e-6  # NDC towards the viewer: wins against the original surface, loses to anything in front of it
