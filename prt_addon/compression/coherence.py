@@ -80,9 +80,10 @@ def make_coherent(encoding: Encoding, triangles: NDArray[np.integer], signal: ND
     moved = _moved_encoding(encoding, search)
     groups = [superclusters(triangles, e.cluster, cluster_registers(e, rows), registers) for e in (encoding, moved)]
     drawn = [overdraw(triangles, group[e.cluster]) for group, e in zip(groups, (encoding, moved), strict=True)]
+    after = before if moved is encoding else moved.squared_error
     return moved, Coherence(
-        overdraw(triangles, encoding.cluster), overdraw(triangles, moved.cluster), *drawn, before,
-        before if moved is encoding else moved.squared_error, int((search.labels != encoding.cluster).sum()), int(groups[1].max(initial=-1)) + 1)
+        overdraw(triangles, encoding.cluster), overdraw(triangles, moved.cluster), *drawn, before, after,
+        int((search.labels != encoding.cluster).sum()), int(groups[1].max(initial=-1)) + 1)
 
 
 def subspace_errors(encoding: Encoding, signal: NDArray[np.floating], points: NDArray[np.integer],
@@ -167,9 +168,9 @@ class _Distances:
 class _Search:
     """Which point may move where, kept up to date while points move.
 
-    A triangle with corners p, q, r is in as many clusters as q and r are, and one more if p's is neither of theirs. So a
-    move of p gains, in clusters summed over triangles, N(new) - N(old), N(c) being the number of p's triangles in which
-    another corner is in c.
+    A triangle with corners p, q, r is in as many clusters as q and r are, and in one more if p's is neither of theirs.
+    So a move of p gains, in clusters summed over triangles, N(new) - N(old), N(c) being the number of p's triangles in
+    which another corner is in c.
 
     corners: points p, ordered; first, second: the other two corners; ends: where each point's corners start.
     labels (p,), errors (p,): now. target, gain, cost, (p,): each point's best move, gain 0 for none.
@@ -216,7 +217,8 @@ class _Search:
         up as if made one after the other."""
         possible = np.flatnonzero((self.gain > 0) & (self.cost <= left))
         possible = possible[np.argsort(-_rates(self.gain[possible], self.cost[possible]), kind="stable")]
-        spent = np.cumsum(self.cost[possible]) > min(step, left)
+        # Without what other moves gain back: those may be beaten below.
+        spent = np.cumsum(np.maximum(self.cost[possible], 0.0)) > min(step, left)
         possible = possible[:max(1, int(spent.argmax()))] if spent.any() else possible
         rank = np.full(len(self.labels), len(possible))
         rank[possible] = np.arange(len(possible))
@@ -289,8 +291,8 @@ def superclusters(triangles: NDArray[np.integer], cluster: NDArray[np.integer], 
                   registers: int = REGISTERS) -> NDArray[np.int64]:
     """The supercluster (clusters,) of each cluster, numbered from 0 in the order of their first clusters.
 
-    Neighbours, which share a triangle, are merged in order of overdraw saved as long as their sizes, sizes (clusters,)
-    in registers, sum up to `registers` at most. cluster: (p,). A merge saves one draw of every triangle that is in both.
+    Neighbours, which share a triangle, are merged in order of overdraw saved, a draw for every triangle that is in
+    both, as long as their sizes, sizes (clusters,) in registers, sum up to `registers` at most. cluster: (p,).
     """
     mixed = _Mixed.of(triangles, cluster, len(sizes))
     total = [int(size) for size in sizes]
