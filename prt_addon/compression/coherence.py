@@ -302,7 +302,7 @@ def superclusters(triangles: NDArray[np.integer], cluster: NDArray[np.integer], 
     heapq.heapify(heap)
     while heap:
         count, one, other = heapq.heappop(heap)
-        # An entry made before one of the two was merged is stale; sums of sizes only grow.
+        # An entry made before one of the two was merged is stale. Sums of sizes only grow, so what fails once is over.
         if mixed.shared[one].get(other) != -count or total[one] + total[other] > registers:
             continue
         total[one] += total[other]
