@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..basis.directions import quadrature
+from ..compression.coherence import Coherence, make_coherent
 from ..compression.encoding import Encoding, encode
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
@@ -96,6 +97,7 @@ class _Bake:
     digests: dict[str, str]
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    coherence: dict[str, Coherence] = field(default_factory=dict)
 
     def run(self) -> Generator[Progress, None, BakeResult]:
         """All stages in order."""
@@ -373,7 +375,7 @@ class _Bake:
             state = _EncodeState()
             yield self._progress("encode", number / len(targets))
             with ThreadPoolExecutor(1) as pool:
-                future = pool.submit(encode, signal, settings, metric, state.report)
+                future = pool.submit(self._encode_one, target, signal, settings, metric, state)
                 try:
                     while True:
                         try:
@@ -384,6 +386,18 @@ class _Bake:
                 finally:
                     state.cancelled = True
         return encodings
+
+    def _encode_one(self, target: SceneObject, signal: NDArray[np.float32], settings: EncoderSettings,
+                    metric: NDArray[np.float64] | None, state: _EncodeState) -> Encoding:
+        """One target's encoding, made coherent where that is asked for."""
+        encoding = encode(signal, settings, metric, state.report)
+        if self.settings.coherence > 0.0:
+            place = np.cumsum(~self.scene.loose[target.points]) - 1
+            triangles = place[self.scene.triangles[target.triangles] - target.points.start]
+            encoding, self.coherence[target.name] = make_coherent(
+                encoding, triangles, signal, self.settings.coherence, metric, self.shapes[target.name][0],
+                tick=lambda: state.report(state.fraction))
+        return encoding
 
     def _encoder_settings(self, receivers: int, shape: tuple[int, int, int]) -> EncoderSettings:
         settings = self.settings
@@ -424,8 +438,9 @@ class _Bake:
                 encodings: dict[str, Encoding], errors: dict[str, Any], bodies: list[BodyLight]) -> BakeResult:
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
         stability += surface_checks(self.surfaces, bodies)
-        report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, errors, stability, gathered,
-                           bounced, self.light, self.resumed, time.perf_counter() - self.started)
+        report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, errors,
+                           stability, gathered, bounced, self.light, self.resumed,
+                           time.perf_counter() - self.started)
         if self.filled:
             note = f"{self.filled} receivers inside other objects take their neighbours' light"
             report["scene"]["warnings"].append(note)

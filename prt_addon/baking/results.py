@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.hemisphere import Indices, hemisphere_basis
-from ..compression.coherence import overdraw
+from ..compression.coherence import Coherence, overdraw
 from ..compression.encoding import Encoding
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import remove_ringing
@@ -115,9 +115,9 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
 
 
 def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: StageTimer,
-              encodings: dict[str, Encoding], errors: dict[str, Any], stability: list[dict[str, Any]],
-              gathered: Gather | None, bounced: Interreflection | None, light: ReferenceLight | None,
-              resumed: list[str], seconds: float) -> dict[str, Any]:
+              encodings: dict[str, Encoding], coherence: dict[str, Coherence], errors: dict[str, Any],
+              stability: list[dict[str, Any]], gathered: Gather | None, bounced: Interreflection | None,
+              light: ReferenceLight | None, resumed: list[str], seconds: float) -> dict[str, Any]:
     """The report of design/contract.md, with what else a reader may want."""
     left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
     windowing = _windowing(light, plan.needs.order, left_out)
@@ -143,7 +143,7 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "errors": errors,
         "error_metric": "relative RMS of exit radiance over random receivers and channels, under "
                         + (light.description if light is not None else "a stand-in sky (the scene has no light)"),
-        "clusters": _clusters(scene, encodings),
+        "clusters": _clusters(scene, encodings, coherence),
         "bounces": None if bounced is None else {
             "method": bounced.method, "count": bounced.bounces, "products": bounced.steps, "history": bounced.history},
         "stability": stability,
@@ -192,8 +192,8 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
     return found
 
 
-def _clusters(scene: SceneMesh, encodings: dict[str, Encoding]) -> dict[str, Any]:
-    """The clusters of all objects together, and object by object."""
+def _clusters(scene: SceneMesh, encodings: dict[str, Encoding], coherence: dict[str, Coherence]) -> dict[str, Any]:
+    """The clusters of all objects together, and object by object; coherence: of those where it ran."""
     objects = {}
     for target in scene.objects:
         encoding = encodings.get(target.name) if target.is_target else None
@@ -211,6 +211,8 @@ def _clusters(scene: SceneMesh, encodings: dict[str, Encoding]) -> dict[str, Any
             "receivers": len(encoding.cluster),
             "history": [[float(t), stage, float(error)] for t, stage, error in encoding.history],
         }
+        if target.name in coherence:
+            objects[target.name]["coherence"] = asdict(coherence[target.name])
     count = sum(o["count"] for o in objects.values())
     receivers = max(1, sum(o["receivers"] for o in objects.values()))
     return {

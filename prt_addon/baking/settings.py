@@ -25,6 +25,9 @@ class BakeSettings:
     clusters, vectors: most clusters, and vectors per cluster, of the encoding (fewer where the signal needs fewer).
     encoder: "static", "iterative" or "adaptive" (Sloan 2003, 4.1-4.3).
     compression_error: relative RMS error of the encoding at which it stops; 0 uses all clusters and vectors.
+    coherence: share of the squared error that may be added to the encoding so that fewer triangles lie in more than one
+        cluster (Sloan 2003, section 5; the paper spent 0.05 to 0.1). 0 = off, because drawing does not need it: each
+        vertex blends its own cluster in one pass. It serves export and renderers that draw cluster by cluster.
     spacing: longest triangle edge as a fraction of the baked objects' diagonal; coarser triangles are refined; 0 = off.
     rotation_group: receivers that share one random rotation of the directions; 0 = all share one set, unrotated.
     error_receivers, error_paths: receivers, and paths from each, of the reference that measures the error; 0 = none.
@@ -47,6 +50,7 @@ class BakeSettings:
     vectors: int = 8
     encoder: str = "iterative"
     compression_error: float = 2e-3
+    coherence: float = 0.0
     spacing: float = 1.0 / 64.0
     rotation_group: int = 0
     error_receivers: int = 64
@@ -84,6 +88,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "clusters": (1, 4096, "the shader's cluster table"),
     "vectors": (0, 24, "six FLOAT4 attributes"),
     "compression_error": (0.0, 1.0, "it is relative"),
+    "coherence": (0.0, 0.5, "the encoder's work would be undone"),
     "spacing": (0.0, 1.0, "it is a fraction of the diagonal"),
     "rotation_group": (0, 2 ** 20, "0 means one set for all"),
     "error_receivers": (0, 4096, "the reference is slow"),
