@@ -53,13 +53,13 @@ class Work:
         """Update a state on `width` leading values; the error returned counts the energy left out as error, so it
         bounds the true one from above."""
         state.resize(width, state.bases.shape[1])
-        return update(self.frame.coordinates[:, :width], state, self.monitor.tick) + float(self.frame.tail[width])
+        return update(self.frame.coordinates[:, :width], state, self.monitor.workers) + float(self.frame.tail[width])
 
     def sweep(self, state: Subspaces, error: float) -> tuple[Sweep, float]:
         """One classification among neighbours and one update, on as many values as the error asks for."""
         width = state.means.shape[1]
         data, before = self.frame.coordinates[:, :width], state.labels
-        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.tick)
+        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers)
         self.neighbours.learn(before, state.labels, sweep.runner_up)
         return sweep, self.fit(state, max(width, self.frame.leading(TRUNCATION * error)))
 
@@ -68,7 +68,7 @@ def static_labels(frame: GlobalFrame, settings: EncoderSettings, monitor: Monito
     """Section 4.1: LBG from random points of the signal."""
     generator = np.random.default_rng(settings.seed)
     data = frame.coordinates
-    return lbg(data, random_means(data, settings.clusters, generator), settings.iterations, monitor.tick)
+    return lbg(data, random_means(data, settings.clusters, generator), settings.iterations, monitor.workers)
 
 
 def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, monitor: Monitor,
@@ -81,11 +81,11 @@ def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, mo
     if settings.target_error is not None:
         vectors, width = settings.vectors, frame.leading(TRUNCATION * enough)
         labels, _ = split_seeds(frame.coordinates, settings.clusters, vectors, enough - frame.tail[width],
-                                lambda _: width, monitor.tick)
+                                lambda _: width, monitor.workers)
     else:
         vectors = min(seed_vectors, settings.vectors)
         labels, error = split_seeds(frame.coordinates, settings.clusters, vectors, enough,
-                                    lambda error: frame.leading(SEED_TRUNCATION * error), monitor.tick)
+                                    lambda error: frame.leading(SEED_TRUNCATION * error), monitor.workers)
         width = frame.leading(TRUNCATION * error)
     return from_labels(labels, int(labels.max()) + 1, width, vectors)
 
@@ -94,7 +94,7 @@ def random_start(frame: GlobalFrame, settings: EncoderSettings, number: int, mon
     """The paper's own start: random points of the signal, LBG, no vectors yet."""
     generator = np.random.default_rng((settings.seed, number))
     means = random_means(frame.coordinates, settings.clusters, generator)
-    labels = lbg(frame.coordinates, means, settings.iterations, monitor.tick)
+    labels = lbg(frame.coordinates, means, settings.iterations, monitor.workers)
     return from_labels(labels, settings.clusters, frame.coordinates.shape[1], 0)
 
 
@@ -117,7 +117,7 @@ def rearrange(work: Work, state: Subspaces, error: float, sweep: Sweep, toleranc
     for _ in range(ROUNDS):
         before = state.copy()
         data = work.frame.coordinates[:, :state.means.shape[1]]
-        if rebalance(data, state, sweep, work.monitor.tick) == 0:
+        if rebalance(data, state, sweep, work.monitor.workers) == 0:
             break
         now, sweep = settle(work, state, work.fit(state, state.means.shape[1]), tolerance)
         if now >= error:
@@ -154,13 +154,13 @@ def polish(work: Work, state: Subspaces, enough: float) -> float:
 
     Clusters that lost all points restart in the worst approximated ones.
     """
-    data, tick = work.frame.coordinates, work.monitor.tick
+    data, workers = work.frame.coordinates, work.monitor.workers
     last = work.fit(state, data.shape[1])
     for _ in range(work.settings.iterations):
-        changed = reclassify(data, state, tick)
-        error = update(data, state, tick)
-        if error > enough and (state.counts == 0).any() and rebalance(data, state, None, tick):
-            error = update(data, state, tick)
+        changed = reclassify(data, state, workers)
+        error = update(data, state, workers)
+        if error > enough and (state.counts == 0).any() and rebalance(data, state, None, workers):
+            error = update(data, state, workers)
         if changed == 0 or error >= last * (1 - work.settings.tolerance):
             break
         last = error

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import PRTError
 from ..linear_algebra import gram, multiply, symmetric_eigenpairs
-from .monitor import Tick, no_tick
+from .workers import SERIAL, Workers
 
 # Rows per pass: bounds the temporaries. Constant, so that results never depend on the memory of a machine.
 CHUNK = 4096
@@ -79,7 +79,7 @@ def metric_roots(metric: NDArray | None, values: int) -> tuple[NDArray, NDArray]
             np.kron(multiply(vectors / roots, vectors.T), columns))
 
 
-def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, tick: Tick = no_tick) -> GlobalFrame:
+def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, workers: Workers = SERIAL) -> GlobalFrame:
     """The principal axes of a signal (p, n) in a metric, and the signal in them.
 
     Raises PRTError for an empty signal, NaN, infinity or an impossible metric.
@@ -87,7 +87,7 @@ def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, ti
     check_signal(signal)
     points, values = signal.shape
     root, inverse_root = metric_roots(metric, values)
-    mean, covariance, scale = _moments(signal, tick)
+    mean, covariance, scale = _moments(signal, workers)
     within = multiply(multiply(root, covariance / points), root)
     _, axes = symmetric_eigenpairs((within + within.T) / 2)
     forward = multiply(root, axes) / scale
@@ -96,7 +96,7 @@ def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, ti
     seen, sums = np.zeros(values), np.zeros(values)
     single = np.ascontiguousarray(forward * scale, np.float32)
     for start in range(0, points, CHUNK):
-        tick()
+        workers.tick()
         block = coordinates[start:start + CHUNK]
         multiply(_centred(signal[start:start + CHUNK], mean, scale), single, out=block)
         seen += np.square(block).sum(axis=0, dtype=np.float64)
@@ -115,7 +115,7 @@ def _centred(block: NDArray[np.floating], mean: NDArray[np.float64], scale: floa
     return np.ascontiguousarray(result, np.float32)
 
 
-def _moments(signal: NDArray[np.floating], tick: Tick) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _moments(signal: NDArray[np.floating], workers: Workers) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Mean (n,) rounded to single precision, scatter about it (n, n) over the scale's square, and the scale, the power
     of two nearest to the largest difference from the mean: sums of single-precision blocks in double precision."""
     points, values = signal.shape
@@ -129,6 +129,6 @@ def _moments(signal: NDArray[np.floating], tick: Tick) -> tuple[NDArray[np.float
     scale = float(2.0 ** np.round(np.log2(largest))) if largest > 0 else 1.0
     scatter = np.zeros((values, values))
     for start in range(0, points, CHUNK):
-        tick()
+        workers.tick()
         scatter += gram(_centred(signal[start:start + CHUNK], mean, scale))
     return mean, scatter, scale
