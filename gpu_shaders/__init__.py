@@ -5,7 +5,8 @@ Reading order is data order:
 
     render_data.py   pure numpy: a BakedTransfer as the arrays that go to the GPU, and the signatures that say when
                      they changed. Never imports gpu or bpy.
-    programs.py      GLSL files -> the two programs (cached; released by `programs.release`).
+    hemisphere_glsl.py   pure text: the functions of the view as GLSL.
+    programs.py      GLSL files -> the programs (cached; released by `programs.release`).
     draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
                      when the data's signature changes, relit when the light's changes, else only drawn.
     viewport.py      the two draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
@@ -17,6 +18,8 @@ The GLSL:
     exit_radiance.comp.glsl    once per light change: exit radiance of every point and row, into a texture
     surface.vert.glsl          once per frame: fetches a point's exit radiance by gl_VertexID
     surface.frag.glsl          multiplies the interpolated radiance by the interpolated albedo
+    view_surface.vert.glsl     the same for view-dependent transfer: all rows of the point, and its local view
+    view_surface.frag.glsl     sums the interpolated rows times spherical harmonics of the local view
 
 Method: clustered principal components (Sloan, Hall, Hart, Snyder 2003, "Clustered Principal Components for
 Precomputed Radiance Transfer", section 6): the light meets only the clusters' bases, on the CPU
@@ -24,6 +27,10 @@ Precomputed Radiance Transfer", section 6): the light meets only the clusters' b
 clusters in separate passes and blends triangles between clusters; here every vertex evaluates its own cluster before
 interpolation, which gives the same picture in one pass and without overdraw. The sum runs once per light change, not
 once per frame, so a frame costs as much as a coloured mesh whatever the number of vectors.
+
+Diffuse bakes keep the cheap program. Where the view counts, every row is interpolated and the functions of the local
+view are evaluated per fragment. Where the view comes from is found in the transform to clip space itself
+(`render_data.viewer_of`), in the space of the bake: perspective, orthographic, and objects moved since, alike.
 
 Colours are scene-linear from end to end; the view transform is Blender's own.
 """

@@ -20,11 +20,13 @@ from .render_data import (
     DrawItem,
     RenderData,
     clip_transform,
+    constant_texels,
     heat_colours,
     light_signature,
     make_render_data,
     matching_light,
     texture_values,
+    viewer_of,
 )
 
 STALE_DIMMING = 0.3  # factor on a stale object's radiance
@@ -50,6 +52,7 @@ class ObjectDrawing:
         self._batch = _make_batch(data)
         self._encoding = make_texture(data.encoding)
         self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
+        self._colours: gpu.types.GPUTexture | None = None
 
     def relight(self, constants: NDArray[np.float32]) -> None:
         """Compute every point's exit radiance from per-cluster constants (clusters, vectors + 1, rows, 3)."""
@@ -57,7 +60,8 @@ class ObjectDrawing:
         expected = (data.clusters, data.vectors + 1, data.rows, 3)
         if constants.shape != expected:
             raise ValueError(f"constants have shape {constants.shape}, the drawn data needs {expected}")
-        constant_values = make_texture(texture_values(constants.reshape(-1, 3)))  # must outlive the dispatch
+        self._colours = None
+        constant_values = make_texture(constant_texels(constants, data.cluster_vectors))  # must outlive the dispatch
         program = programs.exit_radiance()
         program.bind()
         program.uniform_sampler("encoding_values", self._encoding)
@@ -71,7 +75,7 @@ class ObjectDrawing:
 
     def show_colours(self, colours: NDArray[np.float32]) -> None:
         """Draw (points, 3) colours in place of computed radiances."""
-        self._exit = make_texture(texture_values(np.repeat(colours, self.data.rows, axis=0)))
+        self._colours = make_texture(texture_values(colours))
 
     def exit_radiances(self) -> NDArray[np.float32]:
         """The exit radiances on the GPU for unit albedo, (points, rows, 3). Waits for the GPU: for tests and export."""
@@ -83,23 +87,30 @@ class ObjectDrawing:
 
         exposure: factor on the colours. use_albedo: multiply by the surface's albedo; without, unit albedo.
         """
-        program = programs.surface()
+        depends_on_view = bool(self.data.functions) and self._colours is None
+        program = programs.view_surface(self.data.functions) if depends_on_view else programs.surface()
         program.bind()
-        program.uniform_sampler("exit_values", self._exit)
+        program.uniform_sampler("exit_values", self._exit if self._colours is None else self._colours)
         program.uniform_float("transform", Matrix(transform.tolist()))
+        if depends_on_view and programs.sees_viewer(self.data.functions):
+            program.uniform_float("viewer", viewer_of(transform).tolist())
         program.uniform_float("exposure", exposure)
         program.uniform_float("albedo_share", 1.0 if use_albedo else 0.0)
         self._batch.draw(program)
 
 
 def _make_batch(data: RenderData) -> gpu.types.GPUBatch:
-    """The mesh with its albedo as an indexed batch; gl_VertexID is then the point's number."""
+    """The mesh with its albedo, and its frames where the view counts, as an indexed batch; gl_VertexID is then the
+    point's number."""
+    attributes = {"position": data.positions, "albedo": data.albedo}
+    if data.functions:
+        attributes |= {"normal": data.normals, "tangent": data.tangents}
     layout = gpu.types.GPUVertFormat()
-    layout.attr_add(id="position", comp_type="F32", len=3, fetch_mode="FLOAT")
-    layout.attr_add(id="albedo", comp_type="F32", len=3, fetch_mode="FLOAT")
+    for name in attributes:
+        layout.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
     vertices = gpu.types.GPUVertBuf(layout, data.points)
-    vertices.attr_fill("position", data.positions)
-    vertices.attr_fill("albedo", data.albedo)
+    for name, values in attributes.items():
+        vertices.attr_fill(name, values)
     return gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=gpu.types.GPUIndexBuf(type="TRIS", seq=data.triangles))
 
 

@@ -4,7 +4,8 @@
 //
 // encoding_values:   per point ceil((vectors + 1) / 4) texels. The first number is the point's cluster: it stands in
 //                    the place of the mean's weight, which is always 1. Then come the weights of vectors 1, 2, ...
-// constant_values:   texel (cluster * (vectors + 1) + vector) * rows + row
+// constant_values:   texel (cluster * (vectors + 1) + vector) * rows + row; a mean's fourth number tells how many
+//                    vectors its cluster has, where their number is adapted to the cluster
 // exit_values:       texel point * rows + row
 // (Metal reserves words such as constant, vertex and thread: they are no names here.)
 void main()
@@ -18,8 +19,10 @@ void main()
   int first_texel = receiver * ((vectors + 4) / 4);
   vec4 numbers = texelFetch(encoding_values, texel(first_texel), 0);
   int mean = int(numbers.x) * (vectors + 1) * rows + row;
-  vec3 radiance = texelFetch(constant_values, texel(mean), 0).rgb;
-  for (int k = 1; k <= vectors; k++) {
+  vec4 first_constant = texelFetch(constant_values, texel(mean), 0);
+  vec3 radiance = first_constant.rgb;
+  int own_vectors = int(first_constant.a);
+  for (int k = 1; k <= own_vectors; k++) {
     int component = k % 4;
     if (component == 0) {
       numbers = texelFetch(encoding_values, texel(first_texel + k / 4), 0);

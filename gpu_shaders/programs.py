@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The two GPU programs, made of the GLSL files beside this module.
+"""The GPU programs, made of the GLSL files beside this module: one that lights points, one that draws diffuse
+surfaces, and one for each set of functions of the view.
 
 Push constants stay below the 128 bytes that Vulkan guarantees, and every declared one is used: setting an unused one
 raises on OpenGL.
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import gpu
 
+from ..prt_addon.errors import PRTError
+from . import hemisphere_glsl
 from .render_data import TEXTURE_WIDTH
 
 GROUP_SIZE = 64  # invocations of a work group; divides TEXTURE_WIDTH
@@ -58,7 +61,49 @@ def surface() -> gpu.types.GPUShader:
     return gpu.shader.create_from_info(info)
 
 
+def sees_viewer(functions: tuple[int, ...]) -> bool:
+    """Whether some function is not constant. Where none is, nothing of the viewer is declared: see above."""
+    return any(functions)
+
+
+@functools.cache
+def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
+    """The program that draws a lit surface whose radiance depends on the view: see view_surface.vert.glsl.
+
+    functions: of the view, one for each row but the first. Raises PRTError where the driver passes too few numbers
+    from vertices to fragments.
+    """
+    names = ["diffuse_radiance", *hemisphere_glsl.row_names(functions), "surface_albedo"]
+    names += ["local_view"] if sees_viewer(functions) else []
+    most = gpu.capabilities.max_varying_floats_get() // 4  # each takes a slot of four
+    if len(names) > most:
+        raise PRTError("the preview", f"the graphics driver passes {most} values to a pixel, this bake needs "
+                       f"{len(names)}", "Bake with fewer functions of the view")
+    varyings = gpu.types.GPUStageInterfaceInfo(f"prt_view_{len(functions)}_varyings")
+    for name in names:
+        varyings.smooth("VEC3", name)
+    info = gpu.types.GPUShaderCreateInfo()
+    info.define("TEXTURE_WIDTH", str(TEXTURE_WIDTH))
+    info.define("ROWS", str(len(functions) + 1))
+    for slot, name in enumerate(("position", "albedo", "normal", "tangent")):
+        info.vertex_in(slot, "VEC3", name)
+    info.vertex_out(varyings)
+    info.fragment_out(0, "VEC4", "fragment_colour")
+    info.sampler(0, "FLOAT_2D", "exit_values")
+    info.push_constant("MAT4", "transform")
+    if sees_viewer(functions):
+        info.define("SEES_VIEWER")
+        info.push_constant("VEC4", "viewer")
+    info.push_constant("FLOAT", "exposure")
+    info.push_constant("FLOAT", "albedo_share")
+    fetch, total = hemisphere_glsl.fetch_rows(functions), hemisphere_glsl.sum_rows(functions)
+    info.vertex_source("\n".join([_source("texel_layout.glsl"), fetch, _source("view_surface.vert.glsl")]))
+    info.fragment_source("\n".join([total, _source("view_surface.frag.glsl")]))
+    return gpu.shader.create_from_info(info)
+
+
 def release() -> None:
-    """Free both programs; the next use compiles them again."""
+    """Free all programs; the next use compiles them again."""
     exit_radiance.cache_clear()
     surface.cache_clear()
+    view_surface.cache_clear()

@@ -51,7 +51,9 @@ class RenderData:
     """The arrays of one baked object that do not depend on the light.
 
     positions, albedo: (points, 3) float32, contiguous; triangles: (triangles, 3) int32;
-    encoding: (height, TEXTURE_WIDTH, 4) float32, see `encode`.
+    encoding: (height, TEXTURE_WIDTH, 4) float32, see `encode`; cluster_vectors: (clusters,) int32, how many of the
+    `vectors` each cluster really has (the rest are zero). functions: of the view, one for each row but the first;
+    normals, tangents: (points, 3) float32, None without functions.
     """
 
     positions: NDArray[np.float32]
@@ -62,6 +64,10 @@ class RenderData:
     vectors: int
     rows: int
     columns: int
+    cluster_vectors: NDArray[np.int32]
+    functions: tuple[int, ...] = ()
+    normals: NDArray[np.float32] | None = None
+    tangents: NDArray[np.float32] | None = None
 
     @property
     def points(self) -> int:
@@ -108,6 +114,7 @@ def encode(cluster: NDArray[np.integer], weights: NDArray[np.floating]) -> NDArr
 def make_render_data(baked: BakedTransfer) -> RenderData:
     """The arrays that the GPU needs of a baked object. Raises BadScene when they do not fit textures."""
     clusters, vectors_and_mean, rows, columns, _ = baked.bases.shape
+    seen = bool(baked.functions)
     return RenderData(
         positions=np.ascontiguousarray(baked.positions, np.float32),
         albedo=np.ascontiguousarray(baked.albedo, np.float32),
@@ -117,7 +124,28 @@ def make_render_data(baked: BakedTransfer) -> RenderData:
         vectors=vectors_and_mean - 1,
         rows=rows,
         columns=columns,
+        cluster_vectors=used_vectors(baked.bases),
+        functions=baked.functions,
+        normals=np.ascontiguousarray(baked.normals, np.float32) if seen else None,
+        tangents=np.ascontiguousarray(baked.tangents, np.float32) if seen else None,
     )
+
+
+def used_vectors(bases: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Vectors that each cluster has, (clusters,): up to its last that is not zero. Taken from the bases and not from
+    the header, so that a picture never leaves out anything."""
+    used = bases.reshape(*bases.shape[:2], -1).any(axis=2)
+    used[:, 0] = True  # the mean
+    return (bases.shape[1] - 1 - used[:, ::-1].argmax(axis=1)).astype(np.int32)
+
+
+def constant_texels(constants: NDArray[np.float32], cluster_vectors: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Constants (clusters, vectors + 1, rows, 3) as a texture, the number of vectors of its cluster in the fourth
+    component of each mean: there the shader reads it without another fetch."""
+    texels = np.zeros((*constants.shape[:3], 4), np.float32)
+    texels[..., :3] = constants
+    texels[:, 0, :, 3] = cluster_vectors[:, None]
+    return texture_values(texels.reshape(-1, 4))
 
 
 def transfer_signature(baked: BakedTransfer) -> str:
@@ -125,8 +153,9 @@ def transfer_signature(baked: BakedTransfer) -> str:
 
     Call it when data is read, not on every redraw, and keep the result as `DrawItem.key`.
     """
-    digest = hashlib.blake2b(digest_size=16)
-    for values in (baked.cluster, baked.weights, baked.bases, baked.albedo, baked.positions, baked.triangles):
+    digest = hashlib.blake2b(repr(baked.functions).encode(), digest_size=16)
+    drawn = [baked.cluster, baked.weights, baked.bases, baked.albedo, baked.positions, baked.triangles]
+    for values in drawn + ([baked.normals, baked.tangents] if baked.functions else []):
         digest.update(repr((values.shape, values.dtype.str)).encode())
         digest.update(np.ascontiguousarray(values))
     return digest.hexdigest()
@@ -162,3 +191,24 @@ def clip_transform(view_projection: ArrayLike, matrix: ArrayLike) -> NDArray[np.
     transform = np.array(view_projection, np.float64) @ np.array(matrix, np.float64)  # small
     transform[2] -= DEPTH_BIAS * transform[3]
     return transform
+
+
+def viewer_of(transform: ArrayLike) -> NDArray[np.float64]:
+    """Where a (4, 4) transform to clip space is seen from, homogeneous (4,), in the space that it starts from.
+
+    (x, y, z, 1) is the eye of a perspective view; (x, y, z, 0) the unit direction towards the viewer of an
+    orthographic one. Either way `viewer.xyz - viewer.w * point` points from a point to the viewer. The eye is what
+    the transform takes to x = y = w = 0: the cross product in four dimensions of these three rows. It does not depend
+    on the depth range (nor on a depth bias), which would cost digits in an inverse. A transform that flattens, which
+    shows nothing, has no viewer: (0, 0, 1, 0).
+    """
+    rows = np.asarray(transform, np.float64)
+    others = rows[[0, 1, 3]] / np.maximum(np.abs(rows[[0, 1, 3]]).max(axis=1, keepdims=True), 1e-300)
+    viewer = np.array([(-1) ** k * np.linalg.det(np.delete(others, k, axis=1)) for k in range(4)])  # small
+    if rows[2] @ viewer > 0.0:  # small; in front of the near plane, never behind the far one
+        viewer = -viewer
+    largest = np.abs(viewer[:3]).max()
+    if not np.abs(viewer).max() > 1e-12:
+        return np.array([0.0, 0.0, 1.0, 0.0])
+    return viewer / viewer[3] if abs(viewer[3]) > 1e-12 * largest else np.append(
+        viewer[:3] / np.sqrt(np.sum(viewer[:3] ** 2)), 0.0)

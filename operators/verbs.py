@@ -25,7 +25,7 @@ from ..prt_addon.blender.lights import Light, environment_picture, light_coeffic
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import BadArguments, BadScene, StorageError
-from ..prt_addon.relighting.exit_radiance import diffuse_radiance
+from ..prt_addon.relighting.exit_radiance import view_radiance
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
 from ..prt_addon.storage.container import BakedTransfer
@@ -66,12 +66,15 @@ def bake(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def relight(arguments: argparse.Namespace) -> Iterator[str]:
-    """The path written: arrays radiance, position, normal, albedo (points, 3) float32 and object (points,) text."""
+    """The path written: arrays radiance, position, normal, albedo (points, 3) float32 and object (points,) text.
+
+    Where radiance depends on the view, it is that towards the normal.
+    """
     _check_output(arguments.output, (".npz",), arguments.input)
     scene = _open(arguments.input)
     baked = _read_all(scene, arguments.input)
     light = _light(scene, baked, arguments, arguments.use_scene_lights)
-    radiances = [diffuse_radiance(b, light.coefficients[: b.columns]) for b in baked.values()]
+    radiances = [view_radiance(b, light.coefficients[: b.columns], b.normals) for b in baked.values()]
     save_arrays(arguments.output, {
         "radiance": np.concatenate(radiances).astype(np.float32),
         "position": np.concatenate([b.positions for b in baked.values()]),
@@ -127,10 +130,13 @@ def export(arguments: argparse.Namespace) -> Iterator[str]:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise StorageError(str(folder), f"can't be made ({error.strerror})", "Choose another folder") from error
-    index = {"format": "prt", "schema": 1, "arrays": ARRAYS, "objects": []}
+    written = {array: text for array, text in ARRAYS.items()
+               if any(getattr(transfer, array) is not None for transfer in baked.values())}
+    index = {"format": "prt", "schema": 1, "arrays": written, "objects": []}
     for number, (name, transfer) in enumerate(baked.items()):
         path = folder / f"{number:04d}_{_file_name(name)}.npz"
-        save_arrays(path, {array: getattr(transfer, array) for array in ARRAYS})
+        save_arrays(path, {array: getattr(transfer, array) for array in ARRAYS
+                           if getattr(transfer, array) is not None})
         index["objects"].append({"name": name, "file": path.name, "header": transfer.header})
         yield str(path)
     save_json(folder / "baked.json", index)
@@ -142,11 +148,15 @@ ARRAYS = {
     "cluster": "(points,) int32: the cluster of each point",
     "weights": "(points, vectors) float32",
     "bases": "(clusters, vectors+1, rows, columns, channels) float32; vector 0 is the cluster's mean; "
-             "M_p = bases[c,0] + sum_k weights[p,k] bases[c,k+1]; exit radiance = albedo * M_p . light",
+             "M_p = bases[c,0] + sum_k weights[p,k] bases[c,k+1]; exit radiance = albedo * M_p . light; "
+             "with view-dependent rows: albedo * (row 0) + sum_i y_i(view in the point's frame) * (row i), the "
+             "functions i being the header's rows.functions",
     "albedo": "(points, 3) float32, linear Rec.709",
     "positions": "(points, 3) float32, world space when baked, metres, Z up",
     "normals": "(points, 3) float32, world space when baked",
     "triangles": "(triangles, 3) int32 into points",
+    "tangents": "(points, 3) float32, world space when baked: x of the point's frame, whose y is normal x tangent and "
+                "whose z is the normal; only where rows depend on the view",
 }
 
 

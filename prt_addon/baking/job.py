@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import StorageError
 from ..lighting.reference_light import ReferenceLight
 from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..scene.surface_material import SurfaceMaterial
 from ..storage.container import BakedTransfer, check_header
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
@@ -25,10 +26,11 @@ from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
 # Raised whenever the same input would give other numbers, so that old stages are not mixed with new code.
-JOB_SCHEMA = 1
+JOB_SCHEMA = 2
 SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
-_SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose")
+_SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents")
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
+_CONTAINER_EXTRA = ("tangents",)  # None where the transfer needs none
 
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
@@ -41,6 +43,7 @@ def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: Refer
     header = {
         "schema": JOB_SCHEMA,
         "objects": [_object_header(o) for o in scene.objects],
+        "materials": [asdict(material) for material in scene.materials],
         "warnings": list(scene.warnings),
         "settings": settings.as_dict(),
         "geometry_digests": digests or {},
@@ -77,12 +80,19 @@ def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | No
                        "matrix": np.reshape(entry["matrix"], (4, 4))})
         for entry in header["objects"])
     scene = SceneMesh(**{name: arrays[name] for name in _SCENE_ARRAYS}, objects=objects,
+                      materials=tuple(_material(entry) for entry in header["materials"]),
                       warnings=tuple(header["warnings"]))
     light = None
     if header["light"] is not None:
         stored = {name[len("light_"):]: value for name, value in arrays.items() if name.startswith("light_")}
         light = ReferenceLight.from_arrays(stored, header["light"])
     return scene, BakeSettings(**header["settings"]), light, header["geometry_digests"]
+
+
+def _material(entry: dict[str, Any]) -> SurfaceMaterial:
+    """The material of a header's entry: JSON turns its colours into lists."""
+    return SurfaceMaterial(**{name: tuple(value) if isinstance(value, list) else value
+                              for name, value in entry.items()})
 
 
 def run_job(folder: Path) -> Generator[Progress]:
@@ -92,7 +102,7 @@ def run_job(folder: Path) -> Generator[Progress]:
     scene, settings, light, digests = read_job(folder)
     result = yield from bake(scene, settings, folder, light, digests)
     arrays = {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
-              for name in _CONTAINER_ARRAYS}
+              for name in _CONTAINER_ARRAYS + _CONTAINER_EXTRA if getattr(container, name) is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -104,7 +114,8 @@ def read_result(folder: Path) -> BakeResult:
     objects = {}
     for index, (name, header) in enumerate(zip(stored["names"], stored["headers"], strict=True)):
         parts = [arrays[f"{index}_{part}"] for part in _CONTAINER_ARRAYS]
-        container = BakedTransfer(check_header(header, name), *parts)
+        extra = {part: arrays.get(f"{index}_{part}") for part in _CONTAINER_EXTRA}
+        container = BakedTransfer(check_header(header, name), *parts, **extra)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

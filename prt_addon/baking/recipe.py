@@ -11,7 +11,7 @@ import time
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
 from ..reporting.stages import StageTimer
+from ..scene.needs import GREY_TOLERANCE
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
 from ..storage.files import intact, save_arrays
@@ -32,14 +33,24 @@ from ..tracing.tracer import Tracer
 from ..transport.buried import buried_receivers, fill_buried
 from ..transport.direct import direct_transfer
 from ..transport.gather import Gather, gather_operator
+from ..transport.glossy import GlossySurfaces, glossy_transfer, surface_frames
+from ..transport.hemisphere_visibility import HemisphereVisibility, VisibilityCoefficients
+from ..transport.hit_record import HitRecord
+from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, IndirectLight, SumOfRadiances
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
 from .plan import Plan, make_plan, most_clusters
-from .results import object_container, report_of, stability_of
+from .results import object_container, report_of, stability_of, surface_checks
 from .settings import BakeSettings
+from .surfaces import CONSTANT, INCIDENT_ORDER, row_metric
+from .translucency import BodyLight, light_through_bodies
 
 POLL_SECONDS = 0.05
+# Receivers whose layers leave less of the diffuse one than this say nothing about its error.
+LEAST_DIFFUSE = 0.05
+# Share of glossy surfaces among what glossy receivers see from which on their light is followed by its direction.
+LEAST_GLOSSY_HITS = 0.01
 
 
 @dataclass(frozen=True)
@@ -84,6 +95,7 @@ class _Bake:
     light: ReferenceLight | None
     digests: dict[str, str]
     resumed: list[str] = field(default_factory=list)
+    shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
 
     def run(self) -> Generator[Progress, None, BakeResult]:
         """All stages in order."""
@@ -101,19 +113,29 @@ class _Bake:
             with self.timer.stage("gather"):
                 gathered = yield from self._gather()
         with self.timer.stage("direct"):
-            receivers, transfer = yield from self._direct(gathered)
+            receivers, transfer, visibility = yield from self._direct(gathered)
         if gathered is not None:
             with self.timer.stage("interreflection"):
                 bounced = yield from self._interreflection(gathered, transfer)
+        transfer = transfer[:, :, None] if bounced is None else bounced.transfer
+        self.receivers = receivers
+        glossy, subsurface = None, []
+        if visibility is not None:
+            with self.timer.stage("glossy"):
+                glossy = yield from self._glossy(receivers, transfer, visibility, gathered)
+        transfer = self._by_point(receivers, transfer)
+        if self.translucent.any():
+            with self.timer.stage("subsurface"):
+                subsurface = yield from self._subsurface(transfer)
         with self.timer.stage("encode"):
-            transfer = self._by_point(receivers, transfer[:, :, None] if bounced is None else bounced.transfer)
-            self._fill_buried(transfer)
-            encodings = yield from self._encode(transfer)
+            signals = self._signals(transfer, glossy, subsurface)
+            self._fill_buried(transfer, signals)
+            encodings = yield from self._encode(signals)
         errors: dict[str, Any] = {}
         if self.settings.error_receivers and len(self.open_keys):
             with self.timer.stage("errors"):
                 errors = yield from self._errors(transfer, encodings)
-        return self._result(gathered, bounced, transfer, encodings, errors)
+        return self._result(gathered, bounced, transfer, encodings, errors, subsurface)
 
     def _progress(self, stage: str, fraction: float) -> Progress:
         seconds = self.plan.seconds
@@ -151,7 +173,10 @@ class _Bake:
         self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
         self.directions = quadrature(settings.directions, self.plan.needs.order)
         self.gather_directions = quadrature(settings.gather_directions, 4)
-        self.albedo = limited_albedo(self.scene.albedo)
+        self.surfaces = self.plan.surfaces
+        self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
+        self.glossy = self.surfaces.glossy_points(self.scene)
+        self.translucent = self.surfaces.translucent_points(self.scene)
         keep = np.zeros(len(self.scene.points), bool)
         for target in self.targets:
             keep[target.points] = True
@@ -170,22 +195,134 @@ class _Bake:
         else:
             gathered = yield from self._follow("gather", gather_operator(
                 self.tracer, self.scene, self.keys, *self.gather_directions, self.settings.rotation_group,
-                self.settings.seed))
+                self.settings.seed, self._wanted_hits()))
             self._save("gather", _packed_gather(gathered), {n: getattr(gathered, n) for n in GATHER_NUMBERS})
         return gathered if gathered.matrix.nnz else None
 
-    def _direct(self, gathered: Gather | None) -> Generator[Progress, None, tuple[ReceiverSet, NDArray[np.float32]]]:
-        """The receivers and their shadowed transfer (r, columns)."""
+    def _wanted_hits(self) -> NDArray[np.bool_] | None:
+        """By key, whose hits the glossy stage needs again."""
+        return np.concatenate([self.glossy, np.zeros_like(self.glossy)]) if self.glossy.any() else None
+
+    def _direct(self, gathered: Gather | None) -> Generator[
+            Progress, None, tuple[ReceiverSet, NDArray[np.float32], VisibilityCoefficients | None]]:
+        """The receivers, their shadowed transfer (r, columns), and from the same rays the visibility of glossy ones."""
         order = self.plan.needs.order
         receivers = gathered.receivers if gathered else ReceiverSet.of_keys(self.scene, self.tracer, self.keys)
         stored = self._load("direct")
         if stored is not None:
-            return receivers, stored[0]["transfer"]
+            found = stored[0]
+            visibility = VisibilityCoefficients(found["rows"], found["visible"], found.get("blocked")) \
+                if "rows" in found else None
+            return receivers, found["transfer"], visibility
+        plain = None
+        if self.glossy.any():
+            front = receivers.key < len(self.scene.points)
+            chosen = front & self.glossy[receivers.key % len(self.scene.points)]
+            plain = HemisphereVisibility(chosen, INCIDENT_ORDER + order - 1, INCIDENT_ORDER if gathered else 0)
         transfer = yield from self._follow("direct", direct_transfer(
             self.tracer, receivers, *self.directions, order, self.settings.rotation_group, self.settings.seed,
-            self.plan.needs.shadow_rays))
-        self._save("direct", {"transfer": transfer})
-        return receivers, transfer
+            self.plan.needs.shadow_rays, plain))
+        visibility = plain.result(receivers.normals) if plain else None
+        extra = {name: value for name, value in vars(visibility).items() if value is not None} if visibility else {}
+        self._save("direct", {"transfer": transfer, **extra})
+        return receivers, transfer, visibility
+
+    def _glossy(self, receivers: ReceiverSet, transfer: NDArray[np.float32], visibility: VisibilityCoefficients,
+                gathered: Gather | None) -> Generator[Progress, None, NDArray[np.float32]]:
+        """Rows (p, functions, columns, channels) of highlights, by point; zero at points without one.
+
+        transfer: (r, columns, channels) of the receivers, with all bounces.
+        """
+        stored = self._load("glossy")
+        if stored is not None:
+            return stored[0]["rows"]
+        scene, channels = self.scene, self.plan.needs.channels
+        points = receivers.key[visibility.rows]
+        used = np.unique(scene.material[points])
+        kernels = tuple(self.surfaces.parts[number].kernel for number in used)
+        width = max(kernel.shape[2] for kernel in kernels)
+        kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
+        surfaces = GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
+                                  np.searchsorted(used, scene.material[points]), kernels)
+        frames, order = surfaces.frames, self.plan.needs.order
+        indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
+        found = yield from self._follow("glossy", glossy_transfer(
+            self.tracer, surfaces, order, visibility.visible, indirect))
+        if indirect is not None and self._share_of_glossy_hits(gathered.hits) > LEAST_GLOSSY_HITS:
+            # Once more, with what was just found as the light that glossy surfaces send to each other. In the first
+            # round, and so from the second bounce on, they reflect as much, but evenly.
+            bounce = GlossyRadiance(gathered.hits, scene, receivers.key[visibility.rows], frames, found,
+                                    self.surfaces.functions)
+            albedo = self.surfaces.diffuse_albedo(scene)
+            indirect = self._indirect(gathered, receivers, transfer, visibility, albedo, bounce)
+            found = yield from self._follow("glossy", glossy_transfer(
+                self.tracer, surfaces, order, visibility.visible, indirect))
+        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]] for number in used], np.float32)
+        if (windows < 1.0).any():
+            found *= windows[surfaces.material][:, None, :, None]
+        rows = np.zeros((len(scene.points), *found.shape[1:3], channels), np.float32)
+        rows[points] = found  # one channel serves all three
+        self._save("glossy", {"rows": rows})
+        return rows
+
+    def _indirect(self, gathered: Gather | None, receivers: ReceiverSet, transfer: NDArray[np.float32],
+                  visibility: VisibilityCoefficients, albedo: NDArray[np.float32], bounce: GlossyRadiance | None,
+                  ) -> IndirectLight | None:
+        """What glossy receivers get from surfaces: diffuse light of an albedo (p, 3) and a glossy bounce."""
+        if gathered is None or gathered.hits is None:
+            return None
+        channels = transfer.shape[2] if bounce is None else self.plan.needs.channels
+        albedo = albedo[receivers.key % len(self.scene.points)][:, None, :channels]
+        source = DiffuseRadiance(gathered.hits, self.scene, receivers, albedo * transfer)
+        return IndirectLight(gathered.hits, source if bounce is None else SumOfRadiances((source, bounce)),
+                             visibility.rows, visibility.blocked)
+
+    def _share_of_glossy_hits(self, hits: HitRecord) -> float:
+        """Which part of what glossy receivers see of surfaces is glossy itself."""
+        glossy = self.glossy[self.scene.triangles[hits.triangle]].any(axis=1) & hits.front
+        return float(np.mean(glossy)) if len(glossy) else 0.0
+
+    def _subsurface(self, transfer: NDArray[np.float32]) -> Generator[Progress, None, list[BodyLight]]:
+        """Light that travels through each object's translucent materials. transfer: (p, columns, channels)."""
+        return (yield from self._follow("subsurface", light_through_bodies(
+            self.scene, self.surfaces, self.translucent, transfer, self.tracer.threads, self.settings.seed)))
+
+    def _signals(self, transfer: NDArray[np.float32], glossy: NDArray[np.float32] | None,
+                 subsurface: list[BodyLight]) -> dict[str, NDArray[np.float32]]:
+        """Each target's M_p (p, rows, columns, channels): the diffuse row, then those of the view direction."""
+        scene, channels = self.scene, self.plan.needs.channels
+        share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
+        signals = {}
+        for target in self.targets:
+            functions = self.surfaces.functions_of_object(scene, target)
+            material, diffuse = scene.material[target.points], transfer[target.points]
+            signal = np.zeros((len(diffuse), 1 + len(functions), diffuse.shape[1], channels), np.float32)
+            signal[:, 0] = diffuse * share[material, None, None]
+            if glossy is not None and len(functions) == glossy.shape[1]:
+                signal[:, 1:] = glossy[target.points]
+                self._add_dimming(signal, material, diffuse, scene.albedo[target.points])
+            for entry in subsurface:
+                if entry.target == target.name:
+                    signal[entry.points, 1] += entry.transfer / np.float32(CONSTANT)
+            signals[target.name] = signal
+        return signals
+
+    def _add_dimming(self, signal: NDArray[np.float32], material: NDArray[np.int32], diffuse: NDArray[np.float32],
+                     albedo: NDArray[np.float32]) -> None:
+        """Add how the layers above dim the diffuse light over views, to rows 1, 2, ... in place.
+
+        Its colour is the albedo's, so without channels for that it is left out (its mean over views is in row 0).
+        """
+        if signal.shape[3] == 1 and float(np.ptp(albedo, axis=1).max(initial=0.0)) > GREY_TOLERANCE:
+            return
+        colour = albedo[:, None, :signal.shape[3]]
+        for number in np.unique(material):
+            part = self.surfaces.parts[number]
+            if part.kernel is not None and part.dimming.any():
+                chosen = np.flatnonzero(material == number)
+                reflected = colour[chosen] * diffuse[chosen]
+                for row, factor in enumerate(part.dimming.astype(np.float32)):
+                    signal[chosen, 1 + row] += factor * reflected
 
     def _interreflection(self, gathered: Gather, direct: NDArray[np.float32],
                          ) -> Generator[Progress, None, Interreflection]:
@@ -207,23 +344,36 @@ class _Bake:
         result[receivers.key[front]] = transfer[front]
         return result
 
-    def _fill_buried(self, transfer: NDArray[np.float32]) -> None:
+    def _fill_buried(self, transfer: NDArray[np.float32], signals: dict[str, NDArray[np.float32]]) -> None:
         """Replace what lies inside other bodies, and keep it out of the error budget: nobody sees it."""
-        white = transfer[self.keys, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
-        buried = buried_receivers(self.tracer, self.scene, self.keys, white)
-        self.filled = fill_buried(self.scene, buried, transfer) if len(buried) else 0
+        receivers = self.receivers.taken(np.flatnonzero(np.isin(self.receivers.key, self.keys)))
+        white = transfer[receivers.key, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
+        buried = buried_receivers(self.tracer, self.scene, receivers, white)
+        self.filled = 0
+        for target in self.targets:
+            place = target.points
+            inside = buried[(buried >= place.start) & (buried < place.stop)] - place.start
+            if len(inside):
+                triangles = self.scene.triangles[target.triangles] - place.start
+                self.filled += fill_buried(triangles, self.scene.loose[place], inside, signals[target.name])
         self.open_keys = np.setdiff1d(self.keys, buried, assume_unique=True)
 
-    def _encode(self, transfer: NDArray[np.float32]) -> Generator[Progress, None, dict[str, Encoding]]:
+    def _encode(self, signals: dict[str, NDArray[np.float32]]) -> Generator[Progress, None, dict[str, Encoding]]:
         """Each target's encoding; a thread encodes while this one reports, so that a bake can be cancelled."""
         encodings: dict[str, Encoding] = {}
         targets = self.targets
         for number, target in enumerate(targets):
-            signal = transfer[target.points][~self.scene.loose[target.points]]
+            solid = ~self.scene.loose[target.points]
+            signal = signals.pop(target.name)
+            self.shapes[target.name] = signal.shape[1:]
+            signal = (signal if solid.all() else signal[solid]).reshape(int(solid.sum()), -1)
+            metric = row_metric(self.surfaces.functions_of_object(self.scene, target),
+                                self.scene.albedo[target.points][solid])
+            settings = self._encoder_settings(len(signal), self.shapes[target.name])
             state = _EncodeState()
+            yield self._progress("encode", number / len(targets))
             with ThreadPoolExecutor(1) as pool:
-                future = pool.submit(encode, signal.reshape(len(signal), -1), self._encoder_settings(len(signal)), None,
-                                     state.report)
+                future = pool.submit(encode, signal, settings, metric, state.report)
                 try:
                     while True:
                         try:
@@ -235,46 +385,53 @@ class _Bake:
                     state.cancelled = True
         return encodings
 
-    def _encoder_settings(self, receivers: int) -> EncoderSettings:
+    def _encoder_settings(self, receivers: int, shape: tuple[int, int, int]) -> EncoderSettings:
         settings = self.settings
         target = settings.compression_error ** 2 if settings.compression_error > 0.0 else None
-        clusters = most_clusters(settings.clusters, receivers)
+        clusters = most_clusters(settings, receivers, shape)
         return EncoderSettings(clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
                                vectors_limit=24 if settings.encoder == "adaptive" else None)
 
     def _errors(self, transfer: NDArray[np.float32], encodings: dict[str, Encoding],
                 ) -> Generator[Progress, None, dict[str, Any]]:
-        settings = self.settings
-        keys = choose_receivers(self.open_keys, settings.error_receivers, settings.seed)
-        compressed = self._compressed(keys, encodings, transfer.shape[1:])
-        sample = BakedSample(keys, transfer[keys].astype(np.float64), compressed)
-        steps = error_budget(self.tracer, self.scene, self.albedo, sample, self.light or stand_in_light(),
-                             self.plan.needs.order, settings.bounces, settings.error_paths, settings.seed)
-        errors = yield from self._follow("errors", steps)
-        return errors
+        """The error budget of the diffuse rows. transfer: (p, columns, channels) before compression."""
+        settings, channels = self.settings, self.plan.needs.channels
+        share = np.array([part.diffuse_share for part in self.surfaces.parts])[self.scene.material]
+        keys = choose_receivers(self.open_keys[share[self.open_keys] > LEAST_DIFFUSE], settings.error_receivers,
+                                settings.seed)
+        if not len(keys):
+            return {}
+        compressed = self._compressed(keys, encodings, (transfer.shape[1], channels)) / share[keys, None, None]
+        before = np.broadcast_to(transfer[keys], compressed.shape).astype(np.float64)
+        steps = error_budget(self.tracer, self.scene, self.albedo, BakedSample(keys, before, compressed),
+                             self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
+                             settings.error_paths, settings.seed)
+        return (yield from self._follow("errors", steps))
 
-    def _compressed(self, keys: NDArray[np.int64], encodings: dict[str, Encoding], shape: tuple[int, ...],
+    def _compressed(self, keys: NDArray[np.int64], encodings: dict[str, Encoding], shape: tuple[int, int],
                     ) -> NDArray[np.float64]:
-        """Decoded transfer (k, columns, channels) of the receivers `keys`."""
+        """Decoded diffuse rows (k, columns, channels) of the receivers `keys`."""
         result = np.zeros((len(keys), *shape))
         for target in self.targets:
             inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
             place = np.cumsum(~self.scene.loose[target.points]) - 1
             rows = place[keys[inside] - target.points.start]
-            result[inside] = decoded(encodings[target.name], rows).reshape(len(inside), *shape)
+            values = decoded(encodings[target.name], rows)
+            result[inside] = values.reshape(len(inside), self.shapes[target.name][0], *shape)[:, 0]
         return result
 
     def _result(self, gathered: Gather | None, bounced: Interreflection | None, transfer: NDArray[np.float32],
-                encodings: dict[str, Encoding], errors: dict[str, Any]) -> BakeResult:
+                encodings: dict[str, Encoding], errors: dict[str, Any], bodies: list[BodyLight]) -> BakeResult:
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
+        stability += surface_checks(self.surfaces, bodies)
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, errors, stability, gathered,
                            bounced, self.light, self.resumed, time.perf_counter() - self.started)
         if self.filled:
             note = f"{self.filled} receivers inside other objects take their neighbours' light"
             report["scene"]["warnings"].append(note)
-        shape = (1, *transfer.shape[1:])
         objects = {
-            target.name: object_container(self.scene, target, encodings[target.name], shape, self.settings, report,
+            target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],
+                                          self.surfaces.functions_of_object(self.scene, target), self.settings, report,
                                           self.digests.get(target.name, ""))
             for target in self.targets
         }
@@ -308,8 +465,9 @@ def decoded(encoding: Encoding, rows: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _packed_gather(gathered: Gather) -> dict[str, NDArray]:
-    matrix = gathered.matrix
-    return {"key": gathered.receivers.key, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+    matrix, hits = gathered.matrix, gathered.hits
+    packed = {"key": gathered.receivers.key, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+    return packed | ({f"hits_{name}": value for name, value in vars(hits).items()} if hits is not None else {})
 
 
 def _unpack_gather(scene: SceneMesh, tracer: Tracer, arrays: dict[str, NDArray], numbers: dict[str, Any]) -> Gather:
@@ -322,7 +480,9 @@ def _unpack_gather(scene: SceneMesh, tracer: Tracer, arrays: dict[str, NDArray],
     receivers = made.taken(place)
     size = (len(key), len(key))
     matrix = sparse.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=size)
-    return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS))
+    hits = HitRecord(**{field.name: arrays[f"hits_{field.name}"] for field in fields(HitRecord)}) \
+        if "hits_first" in arrays else None
+    return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS), hits)
 
 
 def exhaust(steps: Iterator[Progress]) -> BakeResult:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..basis.hemisphere import Indices, hemisphere_basis
 from ..compression.coherence import overdraw
 from ..compression.encoding import Encoding
 from ..lighting.reference_light import ReferenceLight
@@ -16,12 +17,14 @@ from ..lighting.windowing import remove_ringing
 from ..reporting.stages import StageTimer
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
-from ..storage.container import BakedTransfer, make_header
+from ..storage.container import CONSTANT_ROWS, BakedTransfer, hemisphere_rows, make_header
 from ..storage.digests import digest_json
 from ..transport.gather import Gather
 from ..transport.interreflection import LARGEST_ALBEDO, Interreflection
 from .plan import Plan, most_clusters
 from .settings import BakeSettings
+from .surfaces import SurfacePlan
+from .translucency import BodyLight
 
 REPORT_SCHEMA = 1
 # A white unit environment can light a surface to 1 at most; what is above is sampling error of the gather rays.
@@ -31,8 +34,10 @@ DARK_LIMIT = 0.5
 
 
 def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, shape: tuple[int, int, int],
-                     settings: BakeSettings, report: dict[str, Any], geometry_digest: str) -> BakedTransfer:
-    """The container of one target. shape: (rows, columns, channels). Loose points join cluster 0 with no weights."""
+                     functions: Indices, settings: BakeSettings, report: dict[str, Any], geometry_digest: str,
+                     ) -> BakedTransfer:
+    """The container of one target. shape: (rows, columns, channels); functions: of rows 1, 2, ... Loose points join
+    cluster 0 with no weights."""
     bases = encoding.bases.reshape(*encoding.bases.shape[:2], *shape)
     count, solid = target.points.stop - target.points.start, ~scene.loose[target.points]
     cluster = np.zeros(count, np.int32)
@@ -42,7 +47,7 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
     header = make_header(
         bases.shape,
         {"kind": "spherical_harmonics", "order": order, "condon_shortley": False},
-        {"kind": "constant"},
+        hemisphere_rows(functions) if len(functions) else CONSTANT_ROWS,
         object=target.name,
         vectors_per_cluster=[int(v) for v in encoding.vectors_per_cluster],
         digests={"geometry": geometry_digest, "settings": digest_json(settings.as_dict())},
@@ -56,7 +61,8 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
     triangles = (scene.triangles[target.triangles] - points.start).astype(np.int32)
     return BakedTransfer(header, cluster, weights, np.ascontiguousarray(bases, np.float32),
                          np.ascontiguousarray(scene.albedo[points], np.float32),
-                         scene.points[points].astype(np.float32), scene.normals[points].astype(np.float32), triangles)
+                         scene.points[points].astype(np.float32), scene.normals[points].astype(np.float32), triangles,
+                         scene.tangents[points].astype(np.float32) if len(functions) else None)
 
 
 def _check(check: str, value: float, limit: float, good: str, bad: str) -> dict[str, Any]:
@@ -89,6 +95,22 @@ def stability_of(scene: SceneMesh, transfer: NDArray[np.float32], keys: NDArray[
         largest = float(scene.albedo.max(initial=0.0))
         checks.append(_check("largest albedo", largest, LARGEST_ALBEDO, "ok",
                              f"limited to {LARGEST_ALBEDO}: a closed room of it would never grow dark"))
+    return checks
+
+
+def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[str, Any]]:
+    """Checks of highlights and of light through bodies."""
+    checks = []
+    if len(surfaces.functions):
+        basis = hemisphere_basis(surfaces.functions)
+        checks.append(_check(f"condition of the hemispherical fit ({basis.describe()})", basis.condition_kept, 1e7,
+                             "ok", "rounding shows in highlights: use fewer glossy_rows"))
+    for body in bodies:
+        name = f"{body.material or 'material'} of {body.target}"
+        checks.append(_check(f"error of the tree over {name}, at {body.light.checked} receivers", body.light.error,
+                             0.02, "ok", "light through it is inexact"))
+        checks.append(_check(f"energy that thin parts of {name} had to lose", float(body.light.reduced.max()), 0.05,
+                             "ok", "thinner than its mean free path: the dipole does not hold there"))
     return checks
 
 
@@ -156,7 +178,9 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
                              f"backs fill {gathered.back_share:.2%} of the mean receiver's hemisphere",
                              "a second receiver at each point seen from behind"))
     for name, encoding in encodings.items():
-        used, most = len(encoding.vectors_per_cluster), most_clusters(settings.clusters, len(encoding.cluster))
+        columns, channels = plan.needs.order ** 2, plan.needs.channels
+        shape = (encoding.bases.shape[2] // (columns * channels), columns, channels)
+        used, most = len(encoding.vectors_per_cluster), most_clusters(settings, len(encoding.cluster), shape)
         if encoding.adaptive_left_out:
             found.append(LeftOut(f"the adaptive pass for {name}", "its clusters' errors are even",
                                  "redistributing vectors among clusters"))

@@ -10,6 +10,7 @@ from ..compression.settings import METHODS
 from ..errors import BadArguments
 
 HIGHEST_ORDER = 10
+GLOSSY_ROWS = (0, 4, 9, 16, 24, 25)
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,12 @@ class BakeSettings:
     spacing: longest triangle edge as a fraction of the baked objects' diagonal; coarser triangles are refined; 0 = off.
     rotation_group: receivers that share one random rotation of the directions; 0 = all share one set, unrotated.
     error_receivers, error_paths: receivers, and paths from each, of the reference that measures the error; 0 = none.
+    glossy_rows: most functions of the view direction that a highlight gets (4, 9, 16, 24 or 25); 0 = none: materials
+        are diffuse. Each row costs as much as the whole diffuse transfer.
+    glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
+        most); below, its light stays in the diffuse layer.
+    glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
+    subsurface: whether light travels through translucent materials.
     fit_order_to_light: lower the order to what the scene's present light carries.
     threads: 0 = one per core. seed: of all random choices.
     """
@@ -44,6 +51,10 @@ class BakeSettings:
     rotation_group: int = 0
     error_receivers: int = 64
     error_paths: int = 8192
+    glossy_rows: int = 16
+    glossy_albedo: float = 0.15
+    glossy_window: bool = True
+    subsurface: bool = True
     fit_order_to_light: bool = False
     threads: int = 0
     seed: int = 1
@@ -56,11 +67,11 @@ class BakeSettings:
 PRESETS: dict[str, BakeSettings] = {
     "draft": BakeSettings(order=4, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
                           encoder="static", compression_error=1e-2, spacing=1.0 / 32.0, error_receivers=32,
-                          error_paths=4096),
+                          error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
     "standard": BakeSettings(),
-    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=512, vectors=12,
+    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
                          encoder="adaptive", compression_error=5e-4, spacing=1.0 / 128.0, error_receivers=128,
-                         error_paths=16384),
+                         error_paths=16384, glossy_rows=24, glossy_albedo=0.03),
 }
 
 # Inclusive limits of each number, and why there is a limit at all.
@@ -77,6 +88,8 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "rotation_group": (0, 2 ** 20, "0 means one set for all"),
     "error_receivers": (0, 4096, "the reference is slow"),
     "error_paths": (64, 2 ** 20, "fewer say nothing"),
+    "glossy_rows": (0, 25, "order 5 of the hemisphere"),
+    "glossy_albedo": (0.0, 1.0, "it is a share of the light"),
     "threads": (0, 1024, "0 means one per core"),
     "seed": (0, 2 ** 31 - 1, "a non-negative number"),
 }
@@ -113,6 +126,9 @@ def check(settings: BakeSettings) -> BakeSettings:
         if not low <= value <= high:  # also catches NaN
             raise BadArguments(f"setting {name}", f"{value} is outside {low:g} to {high:g} ({why})",
                                "Choose a value inside")
+    if settings.glossy_rows not in GLOSSY_ROWS:
+        raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
+                           f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
     if settings.encoder not in METHODS:
         raise BadArguments("setting encoder", f"{settings.encoder!r} is not an encoder",
                            f"Use one of {', '.join(METHODS)}")

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from ..errors import BadScene
 from ..scene.scene_mesh import ObjectMesh
+from ..scene.surface_material import SurfaceMaterial
 from .materials import AlbedoReader
+from .surface_tangents import corner_tangents
+from .surfaces import Surface, SurfaceReader
 from .visibility import find_objects, shown_as_in_render
 
 UNSUPPORTED = {"VOLUME": "volume", "POINTCLOUD": "point cloud", "CURVES": "hair curves",
@@ -41,9 +44,11 @@ class _Part:
     """A mesh placed in the world: the object's own or one of its instances (all that share it)."""
 
     arrays: MeshArrays
-    materials: list[bpy.types.Material | None]
+    surfaces: list[Surface]
+    slot: NDArray[np.int32]  # (t,) of each triangle into surfaces
+    tangents: NDArray[np.float32] | None
+    albedo: NDArray[np.float32]
     matrices: list[NDArray[np.float64]] = field(default_factory=list)
-    albedo: NDArray[np.float32] | None = None
 
 
 @dataclass
@@ -65,8 +70,8 @@ def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | N
     warnings = [] if warnings is None else warnings
     with shown_as_in_render(depsgraph) as visible:
         targets = _targets(depsgraph, visible, target_names)
-        albedo_reader = AlbedoReader(depsgraph.scene, warnings)
-        gathered = _gather(depsgraph, visible, albedo_reader, warnings)
+        albedo_reader, surface_reader = AlbedoReader(depsgraph.scene, warnings), SurfaceReader(warnings)
+        gathered = _gather(depsgraph, visible, (albedo_reader, surface_reader), warnings)
         _check_targets(targets, gathered, visible)
         albedo_reader.evaluate()
         everything = target_names is None and not targets
@@ -92,8 +97,8 @@ def _targets(depsgraph: bpy.types.Depsgraph, visible: dict[str, bpy.types.Object
     return {o.name_full: o for o in chosen}
 
 
-def _gather(depsgraph: bpy.types.Depsgraph, visible: dict[str, bpy.types.Object], albedo_reader: AlbedoReader,
-            warnings: list[str]) -> dict[str, _Gathered]:
+def _gather(depsgraph: bpy.types.Depsgraph, visible: dict[str, bpy.types.Object],
+            readers: tuple[AlbedoReader, SurfaceReader], warnings: list[str]) -> dict[str, _Gathered]:
     """Evaluated meshes per object of the outliner, in the order of the depsgraph."""
     gathered: dict[str, _Gathered] = {}
     for instance in depsgraph.object_instances:
@@ -108,7 +113,7 @@ def _gather(depsgraph: bpy.types.Depsgraph, visible: dict[str, bpy.types.Object]
         entry = gathered.setdefault(owner.name_full, _Gathered(owner))
         key = instance.object.data.as_pointer()
         if key not in entry.parts:
-            entry.parts[key] = _read_part(instance, depsgraph, albedo_reader)
+            entry.parts[key] = _read_part(instance, depsgraph, readers, warnings)
         entry.parts[key].matrices.append(np.array(instance.matrix_world, np.float64))
     return gathered
 
@@ -121,23 +126,29 @@ def _casts(instance: bpy.types.DepsgraphObjectInstance, owner: bpy.types.Object)
 
 
 def _read_part(instance: bpy.types.DepsgraphObjectInstance, depsgraph: bpy.types.Depsgraph,
-               albedo_reader: AlbedoReader) -> _Part:
+               readers: tuple[AlbedoReader, SurfaceReader], warnings: list[str]) -> _Part:
     """Arrays and materials of an instance's mesh; registers its albedo with the reader."""
-    evaluated = instance.object
+    evaluated, (albedo_reader, surface_reader) = instance.object, readers
     generated = instance.is_instance and evaluated.original == instance.parent.original
-    if generated:
-        # Geometry that nodes made: the object stands in for it and only its data is the instance's.
-        mesh, slots = evaluated.data, [m and m.original for m in evaluated.data.materials]
-        arrays = read_mesh(mesh)
-    else:
-        slots = [slot.material and slot.material.original for slot in evaluated.material_slots]
-        # to_mesh also gives the faces of a subdivision that otherwise happens on the graphics card only.
-        mesh = evaluated.to_mesh(preserve_all_data_layers=False, depsgraph=depsgraph)
-        arrays = read_mesh(mesh)
+    owner = (instance.parent if instance.is_instance else evaluated).name
+    # Geometry that nodes made: the object stands in for it and only its data is the instance's.
+    slots = ([m and m.original for m in evaluated.data.materials] if generated else
+             [slot.material and slot.material.original for slot in evaluated.material_slots])
+    surfaces = [surface_reader.of(m) for m in slots or [None]]
+    sources = [surface.tangent for surface in surfaces]
+    # to_mesh also gives the faces of a subdivision that otherwise happens on the graphics card only. Texture maps and
+    # places before deformation come along only if asked for.
+    mesh = evaluated.data if generated else evaluated.to_mesh(preserve_all_data_layers=any(sources),
+                                                              depsgraph=depsgraph)
+    arrays = read_mesh(mesh)
+    _check_finite(arrays.positions, owner)
+    # A face whose index exceeds the slots shows the last one, as in Cycles.
+    slot = np.clip(arrays.material_index, 0, len(surfaces) - 1)
+    original = None if generated or not isinstance(evaluated.original.data, bpy.types.Mesh) else evaluated.original.data
+    tangents = corner_tangents(mesh, arrays, slot, sources, owner, warnings, original)
+    if not generated:
         evaluated.to_mesh_clear()
-    part = _Part(arrays, slots)
-    _check_finite(arrays.positions, (instance.parent if instance.is_instance else evaluated).name)
-    part.albedo = np.empty((len(arrays.triangles), 3, 3), np.float32)
+    part = _Part(arrays, surfaces, slot, tangents, np.empty((len(arrays.triangles), 3, 3), np.float32))
     albedo_reader.add(evaluated, evaluated.data if generated else None, depsgraph, arrays, slots,
                       np.array(instance.matrix_world, np.float64), part.albedo)
     return part
@@ -212,19 +223,37 @@ def transform_rows(vectors: NDArray[np.floating], matrix: NDArray[np.float64]) -
 
 def _joined(gathered: _Gathered, is_target: bool) -> ObjectMesh:
     """All parts and instances of one object as one mesh in world space."""
-    positions, triangles, normals, albedo, first = [], [], [], [], 0
+    positions, triangles, normals, albedo, tangents, material_index = [], [], [], [], [], []
+    materials: list[SurfaceMaterial] = []
+    first, directed = 0, any(part.tangents is not None for part in gathered.parts.values())
     for part in gathered.parts.values():
+        slot = part.slot + len(materials)
+        materials += [surface.material for surface in part.surfaces]
         for matrix in part.matrices:
             positions.append(transform_rows(part.arrays.positions, matrix[:3, :3]) + matrix[:3, 3])
             mirrored = _determinant(matrix[:3, :3] / max(np.abs(matrix[:3, :3]).max(), 1e-300)) < 0.0
             order = [0, 2, 1] if mirrored else [0, 1, 2]
             triangles.append(part.arrays.triangles[:, order] + first)
-            world = transform_rows(part.arrays.corner_normals, normal_matrix(matrix))[:, order]
-            length = np.sqrt(np.sum(world ** 2, axis=2, keepdims=True))
-            normals.append((world / np.maximum(length, 1e-300)).astype(np.float32))
+            normals.append(_turned(part.arrays.corner_normals, matrix)[:, order])
             albedo.append(part.albedo[:, order])
+            material_index.append(slot)
+            if directed:
+                tangents.append(np.zeros_like(normals[-1]) if part.tangents is None else
+                                _turned(part.tangents, matrix, keep_length=True)[:, order])
             first += len(part.arrays.positions)
     matrix = np.array(gathered.scene_object.matrix_world, np.float64)
     return ObjectMesh(gathered.scene_object.name_full, np.concatenate(positions),
                       np.concatenate(triangles).astype(np.int32), np.concatenate(normals), np.concatenate(albedo),
-                      is_target, matrix, _determinant(matrix[:3, :3]) < 0.0)
+                      is_target, matrix, _determinant(matrix[:3, :3]) < 0.0, tuple(materials),
+                      np.concatenate(material_index).astype(np.int32), np.concatenate(tangents) if directed else None)
+
+
+def _turned(vectors: NDArray[np.float32], matrix: NDArray[np.float64], keep_length: bool = False,
+            ) -> NDArray[np.float32]:
+    """Vectors (t, 3, 3) taken to the world like normals, of length one or of the length that they had."""
+    world = transform_rows(vectors, normal_matrix(matrix))
+    length = np.sqrt(np.sum(world ** 2, axis=2, keepdims=True))
+    world /= np.maximum(length, 1e-300)
+    if keep_length:
+        world *= np.sqrt(np.sum(vectors.astype(np.float64) ** 2, axis=2, keepdims=True))
+    return world.astype(np.float32)

@@ -3,8 +3,8 @@
 
 The data sits on the object's own mesh where its vertices are the receivers, else on a receiver mesh `PRT <object>`: a
 hidden child of the object. The object points to that mesh, so that appending or linking the object brings the data
-along and renaming anything breaks nothing. Beyond the contract: `prt_albedo` (FLOAT_COLOR) and `prt_normal`
-(FLOAT_VECTOR, in the object's space), both POINT.
+along and renaming anything breaks nothing. Beyond the contract: `prt_albedo` (FLOAT_COLOR), `prt_normal` and, where
+transfer depends on the view, `prt_tangent` (FLOAT_VECTOR, in the object's space), all POINT.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import StorageError
+from ..scene.tangents import tangent_frame
 from ..storage import container
 from ..storage.container import BakedTransfer
 from .fingerprint import fingerprint, geometry_digest, material_digest, used_materials
 from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
-NORMAL_ATTRIBUTE = "prt_normal"
+NORMAL_ATTRIBUTE, TANGENT_ATTRIBUTE = "prt_normal", "prt_tangent"
 RECEIVER_PROPERTY = "prt_receiver"
 RECEIVER_NAME = "PRT {}"
 MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
-OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE)
+OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE,
+        TANGENT_ATTRIBUTE)
 
 
 def write_baked(scene_object: bpy.types.Object, baked: BakedTransfer, digests: dict[str, str | None] | None = None,
@@ -88,7 +90,11 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
     world = transform_rows(arrays.positions, matrix[:3, :3]) + matrix[:3, 3]
     triangles = arrays.triangles[:, [0, 2, 1]] if _mirrors(matrix) else arrays.triangles
     geometry = (albedo, world, _unit_rows(transform_rows(normals, normal_matrix(matrix))), triangles)
-    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name)
+    tangents = None
+    if header["shape"][2] > 1:
+        local = _read_attribute(mesh, TANGENT_ATTRIBUTE, 3, scene_object.name)[:, :3]
+        tangents = tangent_frame(transform_rows(local, matrix[:3, :3]), geometry[2].astype(np.float64))
+    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents)
 
 
 def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
@@ -217,7 +223,7 @@ def _check_shapes(name: str, baked: BakedTransfer) -> None:
     clusters, representatives, rows, columns, channels = baked.bases.shape
     header = {**baked.header, "shape": [clusters, representatives, rows, columns, channels]}
     container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
-                     (baked.albedo, baked.positions, baked.normals, baked.triangles), name)
+                     (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents)
     if baked.weights.shape[1] != representatives - 1:
         raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
 
@@ -238,12 +244,16 @@ def _header(scene_object: bpy.types.Object, baked: BakedTransfer, on_source: boo
 def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDArray[np.float64]) -> None:
     """Attributes and properties of a bake onto a mesh that has its points, in place of any previous ones."""
     _clear_mesh(mesh)
-    local_normals = _unit_rows(transform_rows(baked.normals, normal_matrix(np.linalg.inv(matrix))))  # small
+    inverse = np.linalg.inv(matrix)  # small
+    local_normals = _unit_rows(transform_rows(baked.normals, normal_matrix(inverse)))
     opaque = np.concatenate([baked.albedo, np.ones((len(baked.albedo), 1), np.float32)], axis=1)
     _write_attribute(mesh, container.CLUSTER_ATTRIBUTE, "INT", baked.cluster)
     for index, packed in enumerate(container.pack_weights(baked.weights)):
         _write_attribute(mesh, f"{container.WEIGHTS_ATTRIBUTE}{index}", "FLOAT4", packed)
     _write_attribute(mesh, NORMAL_ATTRIBUTE, "FLOAT_VECTOR", local_normals)
+    if baked.tangents is not None and baked.bases.shape[2] > 1:
+        local_tangents = _unit_rows(transform_rows(baked.tangents, inverse[:3, :3]))
+        _write_attribute(mesh, TANGENT_ATTRIBUTE, "FLOAT_VECTOR", local_tangents)
     _write_attribute(mesh, container.ALBEDO_ATTRIBUTE, "FLOAT_COLOR", opaque)
     mesh[container.BASES_PROPERTY] = np.ascontiguousarray(baked.bases, np.float32).ravel()
     mesh[container.HEADER_PROPERTY] = json.dumps(header)

@@ -31,6 +31,8 @@ SEED_VECTORS = 2
 # Relative decrease of the squared error below which sweeps end while vectors are still to be added, and before the
 # exact ones, in multiples of the tolerance asked for: what these sweeps leave, later ones find.
 WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
+# The same for the exact sweeps at the end, each of which costs as much as three among neighbours.
+EXACT = 4.0 / 3.0
 # Most rounds of rearranging clusters.
 ROUNDS = 2
 
@@ -161,7 +163,7 @@ def polish(work: Work, state: Subspaces, enough: float) -> float:
         error = update(data, state, workers)
         if error > enough and (state.counts == 0).any() and rebalance(data, state, None, workers):
             error = update(data, state, workers)
-        if changed == 0 or error >= last * (1 - work.settings.tolerance):
+        if changed == 0 or error >= last * (1 - EXACT * work.settings.tolerance):
             break
         last = error
     return error

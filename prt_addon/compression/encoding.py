@@ -22,6 +22,8 @@ from .workers import Workers
 
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
 ROUNDING = 1e-12
+# Energy that the frame of a very wide signal may leave out: of the squared error asked for, or of the whole energy.
+UNSEEN, UNSEEN_WITHOUT_TARGET = 0.1, 1e-8
 # Random starts beside the splits share a budget of so many values times clusters; no signal gets more than this many.
 START_BUDGET, MOST_STARTS = 1 << 22, 6
 # Random exchanges of clusters after the starts, for each of the random ones.
@@ -81,8 +83,9 @@ def encode(signal: NDArray[np.floating], settings: EncoderSettings, metric: NDAr
     and fewer clusters and vectors are used where more would not lower the error.
     """
     monitor = Monitor(progress)
+    unseen = UNSEEN * settings.target_error if settings.target_error else UNSEEN_WITHOUT_TARGET
     with Workers(settings.threads, monitor.tick) as monitor.workers:
-        frame = global_frame(signal, metric, monitor.workers)
+        frame = global_frame(signal, metric, monitor.workers, unseen)
         monitor.unit = frame.scale**2
         labels, vectors, left_out = _classify(frame, settings, monitor)
         monitor.span(0.95, 1.0)
@@ -185,9 +188,11 @@ def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.i
             centred = frame.coordinates[rows] - mean
             weights[rows, :len(axes)] = multiply(centred, axes.T)
             discarded[cluster] += np.square(centred - multiply(weights[rows, :len(axes)].astype(float), axes)).sum()
-    original = multiply(bases.reshape(-1, values), frame.backward).reshape(bases.shape)
+    original = multiply(bases.reshape(-1, values), frame.backward).reshape(*bases.shape[:2], -1)
     original[:, 0] += frame.mean
     discarded *= frame.scale**2
+    unseen = frame.tail[-1] * frame.scale**2
+    discarded += unseen * np.array([len(points) for points in members]) / len(labels)
     total = float(discarded.sum())
     energy = frame.energy * frame.scale**2
     return Encoding(labels.astype(np.int32), original.astype(np.float32), weights, kept.astype(np.int32), total,

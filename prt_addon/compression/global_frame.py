@@ -7,27 +7,31 @@ while the error is large and on all of them at the end, so nothing is lost.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from ..errors import PRTError
-from ..linear_algebra import gram, multiply, symmetric_eigenpairs
+from ..linear_algebra import gram, multiply, small_batched_multiply, symmetric_eigenpairs
 from .workers import SERIAL, Workers
 
 # Rows per pass: bounds the temporaries. Constant, so that results never depend on the memory of a machine.
 CHUNK = 4096
+# Values from which on only the leading axes are looked for, how many at first and at most.
+WIDE, FIRST_WIDTH, MOST_WIDTH = 1024, 256, 768
 
 
 @dataclass(frozen=True)
 class GlobalFrame:
     """Coordinates y = (x - mean) forward, x = mean + y backward.
 
-    coordinates: (p, n) float32, scaled so that squares neither overflow nor underflow.
+    coordinates: (p, d) float32, d = n but for very wide signals, scaled so that squares neither overflow nor underflow.
     mean (n,), forward (n, n), backward (n, n): float64; both carry the scale and the metric.
     scale: coordinates times scale are in the metric's units.
-    tail: (n + 1,) float64; tail[d] is the energy (sum of squares) of coordinates beyond the leading d.
+    tail: (d + 1,) float64; tail[k] is the energy (sum of squares) beyond the leading k coordinates.
     energy: the signal's own sum of squares about zero, in squared coordinates.
     """
 
@@ -41,7 +45,7 @@ class GlobalFrame:
 
     def leading(self, error: float) -> int:
         """How many leading values leave out at most `error` of the energy; at least one."""
-        return max(1, int(np.searchsorted(-self.tail, -error)))
+        return min(max(1, int(np.searchsorted(-self.tail, -error))), self.coordinates.shape[1])
 
 
 def check_signal(signal: NDArray) -> None:
@@ -79,13 +83,17 @@ def metric_roots(metric: NDArray | None, values: int) -> tuple[NDArray, NDArray]
             np.kron(multiply(vectors / roots, vectors.T), columns))
 
 
-def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, workers: Workers = SERIAL) -> GlobalFrame:
+def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, workers: Workers = SERIAL,
+                 left_out: float = 1e-8) -> GlobalFrame:
     """The principal axes of a signal (p, n) in a metric, and the signal in them.
 
+    left_out: share of the energy that a frame of more than WIDE values may leave out for good (`leading_frame`).
     Raises PRTError for an empty signal, NaN, infinity or an impossible metric.
     """
     check_signal(signal)
     points, values = signal.shape
+    if values > WIDE:
+        return leading_frame(signal, metric, left_out, workers)
     root, inverse_root = metric_roots(metric, values)
     mean, covariance, scale = _moments(signal, workers)
     within = multiply(multiply(root, covariance / points), root)
@@ -118,6 +126,16 @@ def _centred(block: NDArray[np.floating], mean: NDArray[np.float64], scale: floa
 def _moments(signal: NDArray[np.floating], workers: Workers) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Mean (n,) rounded to single precision, scatter about it (n, n) over the scale's square, and the scale, the power
     of two nearest to the largest difference from the mean: sums of single-precision blocks in double precision."""
+    mean, scale = _mean_and_scale(signal)
+    scatter = np.zeros((signal.shape[1], signal.shape[1]))
+    for start in range(0, len(signal), CHUNK):
+        workers.tick()
+        scatter += gram(_centred(signal[start:start + CHUNK], mean, scale))
+    return mean, scatter, scale
+
+
+def _mean_and_scale(signal: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    """See `_moments`."""
     points, values = signal.shape
     mean, low, high = np.zeros(values), np.full(values, np.inf), np.full(values, -np.inf)
     for start in range(0, points, CHUNK):
@@ -126,9 +144,80 @@ def _moments(signal: NDArray[np.floating], workers: Workers) -> tuple[NDArray[np
         low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
     mean = (mean / points).astype(np.float32).astype(np.float64)
     largest = float(np.maximum(high - mean, mean - low).max())
-    scale = float(2.0 ** np.round(np.log2(largest))) if largest > 0 else 1.0
-    scatter = np.zeros((values, values))
+    return mean, float(2.0 ** np.round(np.log2(largest))) if largest > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class _Wide:
+    """A wide signal in its metric, block by block. root, inverse: (m, m), None where there is no metric."""
+
+    signal: NDArray[np.floating]
+    mean: NDArray[np.float64]
+    scale: float
+    root: NDArray[np.float64] | None
+    inverse: NDArray[np.float64] | None
+
+    @staticmethod
+    def of(signal: NDArray[np.floating], metric: NDArray | None) -> _Wide:
+        mean, scale = _mean_and_scale(signal)
+        if metric is None:
+            return _Wide(signal, mean, scale, None, None)
+        if signal.shape[1] % len(metric):
+            metric_roots(metric, signal.shape[1])  # raises
+        return _Wide(signal, mean, scale, *metric_roots(metric, len(metric)))
+
+    def within(self, rows: NDArray[np.floating], matrix: NDArray[np.float64] | None) -> NDArray:
+        """Rows (b, n), seen as (m, n / m) each, times a matrix (m, m) from the left."""
+        if matrix is None:
+            return rows
+        stacked = rows.reshape(len(rows), len(matrix), -1)
+        return small_batched_multiply(matrix.astype(rows.dtype)[None], stacked).reshape(rows.shape)
+
+    def blocks(self, workers: Workers) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """Centred rows in the metric, in single precision."""
+        for start in range(0, len(self.signal), CHUNK):
+            workers.tick()
+            part = slice(start, start + CHUNK)
+            yield part, self.within(_centred(self.signal[part], self.mean, self.scale), self.root)
+
+
+def leading_frame(signal: NDArray[np.floating], metric: NDArray | None, left_out: float, workers: Workers = SERIAL,
+                  ) -> GlobalFrame:
+    """As `global_frame` for signals so wide that all their axes cost more than the encode itself: only as many leading
+    ones as leave out `left_out` of the energy, which tail[-1] holds and every error counts in.
+
+    A randomised range finder with one power step (Halko, Martinsson & Tropp 2011, algorithm 4.4), made wider
+    until it holds enough or MOST_WIDTH is reached.
+    """
+    points, values = signal.shape
+    wide = _Wide.of(signal, metric)
+    generator = np.random.default_rng(0)
+    width, most = FIRST_WIDTH, min(points, values, MOST_WIDTH)
+    while True:
+        width = min(width, most)
+        sample = np.zeros((values, width))
+        directions = generator.standard_normal((values, width), np.float32)
+        for _, block in wide.blocks(workers):
+            sample += multiply(block.T, multiply(block, directions))
+        basis = np.ascontiguousarray(linalg.qr(sample, mode="economic")[0], np.float32)
+        coordinates = np.empty((points, width), np.float32)
+        rest, energy, offset = 0.0, 0.0, wide.within(wide.mean[None] / wide.scale, wide.root)
+        for part, block in wide.blocks(workers):
+            coordinates[part] = multiply(block, basis)
+            energy += float(np.sum(np.square(block + offset), dtype=np.float64))
+            block -= multiply(coordinates[part], basis.T)
+            rest += float(np.sum(np.square(block), dtype=np.float64))
+        if rest <= left_out * energy or width == most:
+            break
+        width *= 3
+    _, turn = symmetric_eigenpairs(gram(coordinates).astype(np.float64))
+    axes = multiply(basis.astype(np.float64), turn)
+    seen = np.zeros(width)
     for start in range(0, points, CHUNK):
-        workers.tick()
-        scatter += gram(_centred(signal[start:start + CHUNK], mean, scale))
-    return mean, scatter, scale
+        block = coordinates[start:start + CHUNK]
+        block[...] = multiply(block, turn.astype(np.float32))
+        seen += np.square(block).sum(axis=0, dtype=np.float64)
+    tail = np.append(np.cumsum(seen[::-1])[::-1], 0.0) + rest
+    backward = wide.within(np.ascontiguousarray(axes.T), wide.inverse) * wide.scale
+    forward = wide.within(np.ascontiguousarray(axes.T), wide.root).T / wide.scale
+    return GlobalFrame(coordinates, wide.mean, forward, backward, wide.scale, tail, max(energy, float(tail[0]) * 1e-3))

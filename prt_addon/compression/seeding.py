@@ -19,7 +19,7 @@ from .subspaces import SPARE, Fit, Single, fit_subspace, squared_distances
 from .workers import SERIAL, Workers
 
 # Alternations of fitting both halves and reassigning their points.
-ROUNDS = 3
+ROUNDS = 2
 # Share of the scatter below which an error in single precision is rounding.
 CANCELLATION = 1e-4
 

@@ -7,12 +7,14 @@ light; each point then blends the constants of its own cluster.
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
+from ..basis.spherical_harmonics import evaluate
 from ..linear_algebra import multiply, sparse_multiply
 
 FloatArray = NDArray[np.float32]
@@ -25,6 +27,13 @@ class Baked(Protocol):
     weights: FloatArray
     bases: FloatArray
     albedo: FloatArray
+    normals: FloatArray
+    tangents: FloatArray | None
+
+    @property
+    def functions(self) -> tuple[int, ...]:
+        """The spherical harmonics of the exit direction that rows 1, 2, ... belong to."""
+        ...
 
 
 def cluster_constants(bases: FloatArray, light: ArrayLike) -> FloatArray:
@@ -85,3 +94,49 @@ def diffuse_radiance(baked: Baked, light: ArrayLike) -> FloatArray:
         raise ValueError(f"diffuse radiance needs transfer with 1 row, not {baked.bases.shape[2]}")
     constants = cluster_constants(baked.bases, light)
     return exit_radiance(baked.cluster, baked.weights, constants)[:, 0] * baked.albedo
+
+
+def view_radiance(baked: Baked, light: ArrayLike, views: ArrayLike) -> FloatArray:
+    """Radiance (p, 3) float32 that leaves every receiver towards its view, diffuse transfer too.
+
+    light: (columns, 3) coefficients; views: (p, 3) directions in world space when baked, away from the surface, of any
+    length above zero. Views from behind the surface: see `hemisphere_values`. Raises ValueError where shapes do not
+    fit.
+    """
+    views = np.asarray(views, np.float64)
+    if views.shape != baked.normals.shape:
+        raise ValueError(f"one view for each of {len(baked.normals)} receivers is needed, not {views.shape}")
+    if not baked.functions:
+        return diffuse_radiance(baked, light)
+    rows = exit_radiance(baked.cluster, baked.weights, cluster_constants(baked.bases, light))
+    values = hemisphere_values(baked.functions, local_views(views, baked.normals, baked.tangents))
+    return combine_rows(rows, baked.albedo, values)
+
+
+def local_views(views: ArrayLike, normals: ArrayLike, tangents: ArrayLike) -> NDArray[np.float64]:
+    """Views (p, 3) in the frames of receivers: x along the tangent, y along normal x tangent, z along the normal."""
+    views, normals, tangents = (np.asarray(v, np.float64) for v in (views, normals, tangents))
+    return np.stack([np.sum(views * axis, axis=1) for axis in (tangents, np.cross(normals, tangents), normals)], axis=1)
+
+
+def hemisphere_values(functions: tuple[int, ...], local: NDArray[np.float64]) -> NDArray[np.float64]:
+    """y_i (p, functions) of local views (p, 3) of any length above zero.
+
+    Rows are fitted over the upper hemisphere only and mean nothing below it, so a view from behind is mirrored to the
+    front: continuous at the horizon, where interpolated normals dip under it, and a back face looks like the front
+    from the mirrored place.
+    """
+    unit = local / np.sqrt(np.sum(local ** 2, axis=1, keepdims=True))
+    unit[:, 2] = np.abs(unit[:, 2])
+    order = math.isqrt(max(functions)) + 1
+    return evaluate(order, unit)[:, list(functions)]
+
+
+def combine_rows(rows: FloatArray, albedo: FloatArray, values: NDArray[np.floating]) -> FloatArray:
+    """albedo * row 0 + sum_i y_i * row i, (p, 3) float32, of rows (p, 1 + functions, 3) and y_i (p, functions)."""
+    if rows.shape[1] != 1 + values.shape[1]:
+        raise ValueError(f"{rows.shape[1]} rows need {rows.shape[1] - 1} functions, not {values.shape[1]}")
+    radiance = albedo * rows[:, 0]
+    for index in range(values.shape[1]):
+        radiance += values[:, index, None].astype(np.float32) * rows[:, 1 + index]
+    return radiance

@@ -41,18 +41,19 @@ class Needs:
 
 
 def decide(scene: SceneMesh, order: int, bounces: int, planned_rays: tuple[int, int],
-           light_order: int | None = None, fit_order_to_light: bool = False) -> Needs:
+           light_order: int | None = None, fit_order_to_light: bool = False, coloured_surfaces: bool = False) -> Needs:
     """What a bake of `scene` at `order` needs.
 
     bounces: asked for (-1 as many as it takes). planned_rays: of the shadow and the gather stage, for what is saved.
-    light_order: highest order in which the scene's light carries energy, if known.
+    light_order: highest order in which the scene's light carries energy, if known. coloured_surfaces: highlights or
+    subsurface light differ between channels.
     """
     needs = Needs(True, bounces != 0, 1, order)
     shadow, gather = planned_rays
     _need_shadows(scene, needs, shadow, gather)
     if needs.bounces:
         _need_bounces(scene, needs, gather)
-    if needs.bounces and _coloured(scene):
+    if coloured_surfaces or (needs.bounces and _coloured(scene)):
         needs.channels = 3
     else:
         why = "every albedo that bounces light is grey" if needs.bounces else "no light is bounced to take on colour"
@@ -74,7 +75,7 @@ def _need_shadows(scene: SceneMesh, needs: Needs, shadow: int, gather: int) -> N
 
 
 def _need_bounces(scene: SceneMesh, needs: Needs, gather: int) -> None:
-    if float(scene.albedo[~scene.loose].max(initial=0.0)) < BLACK:
+    if float(scene.albedo[~scene.loose].max(initial=0.0)) < BLACK and all(m.is_diffuse for m in scene.materials):
         needs.bounces = False
         needs.left_out.append(LeftOut("bounces", "every surface is black", f"{gather:,} rays"))
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BadScene
+from .surface_material import DIFFUSE, SurfaceMaterial
 
 # Metres; beyond, squares and cubes of lengths leave single precision, and Blender clamps coordinates at 3e38.
 FARTHEST = 1e18
@@ -22,6 +23,9 @@ class ObjectMesh:
     corner_normals, corner_albedo: (t, 3, 3) float32; unit shading normals, linear Rec.709 reflectance in [0, 1].
     is_target: transfer is stored for it (every object casts shadows and bounces light).
     matrix: (4, 4) float64, object to world. winding_flipped: the reader turned the triangles of a mirrored object.
+    materials: what they do beyond diffuse reflection. material_index: (t,) int32 into materials; None is all 0.
+    corner_tangents: (t, 3, 3) float32 directions of any length along the surface, zero where any direction serves
+    (isotropic materials); None is zero everywhere.
     """
 
     name: str
@@ -32,6 +36,16 @@ class ObjectMesh:
     is_target: bool
     matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     winding_flipped: bool = False
+    materials: tuple[SurfaceMaterial, ...] = (DIFFUSE,)
+    material_index: NDArray[np.int32] | None = None
+    corner_tangents: NDArray[np.float32] | None = None
+
+    def with_triangles(self, kept: NDArray[np.bool_]) -> ObjectMesh:
+        """The mesh with only some of its triangles, (t,) bool."""
+        return replace(self, triangles=self.triangles[kept], corner_normals=self.corner_normals[kept],
+                       corner_albedo=self.corner_albedo[kept],
+                       material_index=None if self.material_index is None else self.material_index[kept],
+                       corner_tangents=None if self.corner_tangents is None else self.corner_tangents[kept])
 
 
 def bounding_diagonal(point_sets: list[NDArray[np.float64]]) -> float:
@@ -58,6 +72,7 @@ def clean(mesh: ObjectMesh, warnings: list[str]) -> ObjectMesh:
     if uncoloured:
         raise BadScene(mesh.name, f"the colour of {uncoloured} triangles is not a number",
                        "Mend the colours of its materials")
+    _check_materials(mesh)
     if not len(mesh.triangles):
         if mesh.is_target:
             raise BadScene(mesh.name, "the mesh has no faces", "Add faces, or bake another object")
@@ -79,5 +94,14 @@ def clean(mesh: ObjectMesh, warnings: list[str]) -> ObjectMesh:
         if mesh.is_target:
             raise BadScene(mesh.name, "all faces have zero area", "Give the faces an area, or bake another object")
         warnings.append(f"{mesh.name}: casts nothing, all faces have zero area")
-    return replace(mesh, triangles=mesh.triangles[kept], corner_normals=mesh.corner_normals[kept],
-                   corner_albedo=mesh.corner_albedo[kept])
+    return mesh.with_triangles(kept)
+
+
+def _check_materials(mesh: ObjectMesh) -> None:
+    """Raise ValueError where a reader's material numbers or tangents do not fit its triangles: a bug, not bad input."""
+    count, index = len(mesh.triangles), mesh.material_index
+    if index is not None and (index.shape != (count,) or (count and not 0 <= index.min() <= index.max()
+                                                          < len(mesh.materials))):
+        raise ValueError(f"{mesh.name}: material numbers do not fit {count} triangles, {len(mesh.materials)} materials")
+    if mesh.corner_tangents is not None and mesh.corner_tangents.shape != (count, 3, 3):
+        raise ValueError(f"{mesh.name}: tangents {mesh.corner_tangents.shape} do not fit {count} triangles")

@@ -42,5 +42,6 @@ def outward(mesh: ObjectMesh, others: list[ObjectMesh], warnings: list[str]) -> 
         if len(other.positions) and np.any(np.all((other.positions > low) & (other.positions < high), axis=1)):
             return mesh
     warnings.append(f"{mesh.name}: all faces point inwards; baked as if they pointed outwards (recalculate normals)")
-    return replace(mesh, triangles=np.ascontiguousarray(mesh.triangles[:, ::-1]),
+    tangents = None if mesh.corner_tangents is None else mesh.corner_tangents[:, ::-1]
+    return replace(mesh, triangles=np.ascontiguousarray(mesh.triangles[:, ::-1]), corner_tangents=tangents,
                    corner_normals=-mesh.corner_normals[:, ::-1], corner_albedo=mesh.corner_albedo[:, ::-1])

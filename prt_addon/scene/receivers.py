@@ -15,7 +15,7 @@ LIFT = 1e-6
 # Faces steeper than this against the shading normal can't be cleared by moving along it.
 STEEPEST = 0.1
 # Faces at a point that are told apart; the pole of a fine sphere has hundreds that hardly differ.
-MOST_FACES = 4
+MOST_FACES = 8
 # The lift may not carry a receiver further than this fraction of the distance to its faces' middle.
 HIGHEST = 0.25
 

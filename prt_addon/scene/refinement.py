@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BadScene
+from .tangents import tangent_frame
 
 # Halvings of an edge: enough for a landscape of a thousand kilometres under a teapot.
 MAXIMUM_ROUNDS = 24
@@ -41,11 +42,30 @@ class EdgeLimit:
         return too_long
 
 
+@dataclass
+class Beside:
+    """What points carry besides position, normal and albedo.
+
+    material: (p,) int32; an edge whose ends differ (they can't on a split surface) gives its middle the lower number.
+    tangents: (p, 3) float64, unit and orthogonal to the normal, or None to leave them out.
+    """
+
+    material: NDArray[np.int32]
+    tangents: NDArray[np.float64] | None
+
+    def grow(self, ends: NDArray[np.int64], normals: NDArray[np.float64]) -> None:
+        """Append the middles of edges (e, 2), whose normals (e, 3) are known."""
+        self.material = np.concatenate([self.material, self.material[ends].min(axis=1)])
+        if self.tangents is not None:
+            between = tangent_frame(self.tangents[ends].sum(axis=1), normals)
+            self.tangents = np.concatenate([self.tangents, between])
+
+
 def refine(points: NDArray[np.float64], normals: NDArray[np.float64], albedo: NDArray[np.float64],
-           triangles: NDArray[np.int32], limit: EdgeLimit, name: str,
+           triangles: NDArray[np.int32], limit: EdgeLimit, name: str, beside: Beside | None = None,
            ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
     """Split edges longer than the limit at their middle until none is left. Raises BadScene, naming the object `name`,
-    where that asks for more points than any machine has memory for.
+    where that asks for more points than any machine has memory for. beside: grows along with the points.
 
     An edge is split for both its triangles or for neither, so no T-junction appears between triangles that share
     points. New points stay on the flat triangle (shadows fall on what is drawn); normals and albedo are interpolated.
@@ -70,6 +90,8 @@ def refine(points: NDArray[np.float64], normals: NDArray[np.float64], albedo: ND
         between = np.where(length > 1e-6, between / np.maximum(length, 1e-6), normals[ends[:, 0]])
         normals = np.concatenate([normals, between])
         albedo = np.concatenate([albedo, albedo[ends].mean(axis=1)])
+        if beside is not None:
+            beside.grow(ends, between)
         triangles = _cut(points, triangles, middle)
     return points, normals, albedo, triangles
 

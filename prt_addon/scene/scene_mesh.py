@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The traced scene: one triangle soup whose points are the receivers.
 
-A vertex where normals or albedo differ between its faces becomes one point per group of equal face corners, so that a
-cube gets right edges and two materials meet in a sharp line. Triangles too coarse for per-point transfer are refined.
-Nothing in later stages has to know about vertices, corners or objects again: M_p belongs to a point.
+A vertex where normals, albedo or materials differ between its faces becomes one point per group of equal face corners,
+so that a cube gets right edges and two materials meet in a sharp line. Triangles too coarse for per-point transfer are
+refined. Nothing in later stages has to know about vertices, corners or objects again: M_p belongs to a point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 from ..errors import BadScene
 from .object_mesh import ObjectMesh, bounding_diagonal, clean
 from .orientation import outward
-from .refinement import EdgeLimit, refine
+from .refinement import Beside, EdgeLimit, refine
+from .surface_material import DIFFUSE, SurfaceMaterial
+from .tangents import UP, quiet_pole, smooth_tangents, tangent_frame
 
 # Corners of one vertex whose normals differ by less than 0.25 degrees, or albedos by less than half an 8-bit step, are
 # one receiver: below what interpolation shows, above the noise of Blender's packed custom normals.
 NORMAL_TOLERANCE = 0.0044
 ALBEDO_TOLERANCE = 0.5 / 255.0
+# Wanted tangents of one vertex that differ by less than 30 degrees are averaged: more than the faces of a coarse mesh
+# differ along a smooth texture map, less than its pieces do across a seam.
+TANGENT_TOLERANCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,8 @@ class SceneMesh:
 
     points, normals: (p, 3) float64 world space; triangles: (t, 3) int32 into points; albedo: (p, 3) float32;
     loose: (p,) bool, points without a face (they keep their place, so that data fits the mesh, and get no transfer);
+    material: (p,) int32 into materials; tangents: (p, 3) float64, unit, orthogonal to the normals; materials: each
+    once (names aside), the first always DIFFUSE, which stands for all that only reflect diffusely;
     warnings: what was dropped or repaired, one line each.
     """
 
@@ -55,7 +62,10 @@ class SceneMesh:
     triangles: NDArray[np.int32]
     albedo: NDArray[np.float32]
     loose: NDArray[np.bool_]
+    material: NDArray[np.int32]
+    tangents: NDArray[np.float64]
     objects: tuple[SceneObject, ...]
+    materials: tuple[SurfaceMaterial, ...] = (DIFFUSE,)
     warnings: tuple[str, ...] = ()
 
     @property
@@ -82,8 +92,9 @@ class SceneMesh:
             name = next(o.name for o in cleaned if o.is_target)
             raise BadScene(name, "all vertices lie in one point", "Give the object a size")
         limit = EdgeLimit(spacing * diagonal, targets.min(axis=0), targets.max(axis=0))
-        parts = [_split(o, limit, warnings) for o in cleaned]
-        return _join(cleaned, parts, tuple(warnings))
+        materials, numbers = _number_materials(cleaned)
+        parts = [_split(o, of_triangle, limit, warnings) for o, of_triangle in zip(cleaned, numbers, strict=True)]
+        return _join(cleaned, parts, materials, tuple(warnings))
 
 
 @dataclass(frozen=True)
@@ -94,11 +105,35 @@ class _Part:
     normals: NDArray[np.float64]
     albedo: NDArray[np.float32]
     triangles: NDArray[np.int32]
+    material: NDArray[np.int32]
+    tangents: NDArray[np.float64]
     matches_source: bool
 
 
-def _corner_groups(mesh: ObjectMesh) -> tuple[NDArray[np.int64], int]:
-    """The group of each corner (t * 3,) such that corners of one group share vertex, normal and albedo.
+def _number_materials(objects: list[ObjectMesh]) -> tuple[tuple[SurfaceMaterial, ...], list[NDArray[np.int32]]]:
+    """The scene's materials, and per object the number of each triangle's (t,).
+
+    Materials that are equal but for their names count as one, and whatever is only diffuse as DIFFUSE.
+    """
+    number = {DIFFUSE: 0}
+    materials, numbers = [DIFFUSE], []
+    for mesh in objects:
+        table = []
+        for material in mesh.materials:
+            key = DIFFUSE if material.is_diffuse else replace(material, name="")
+            if key not in number:
+                number[key] = len(materials)
+                materials.append(material)
+            table.append(number[key])
+        index = np.zeros(len(mesh.triangles), np.int32) if mesh.material_index is None else mesh.material_index
+        numbers.append(np.array(table, np.int32)[index])
+    return tuple(materials), numbers
+
+
+def _corner_groups(mesh: ObjectMesh, material: NDArray[np.int32], tangent: NDArray[np.float64] | None,
+                   ) -> tuple[NDArray[np.int64], int]:
+    """The group of each corner (t * 3,) such that corners of one group share vertex, normal, albedo, material (t,) and
+    tangent (t * 3, 3).
 
     Corners of a vertex are compared with the vertex's first ungrouped corner, round after round: one round for a
     smooth mesh, as many as the vertex has groups otherwise. Group g < v is the first group of vertex g.
@@ -106,6 +141,8 @@ def _corner_groups(mesh: ObjectMesh) -> tuple[NDArray[np.int64], int]:
     vertex = mesh.triangles.ravel().astype(np.int64)
     normal = mesh.corner_normals.reshape(-1, 3)
     albedo = mesh.corner_albedo.reshape(-1, 3)
+    several = len(material) > 0 and int(material.min()) != int(material.max())
+    of_corner = np.repeat(material, 3)
     group = np.full(len(vertex), -1, np.int64)
     count = len(mesh.positions)
     pending = np.arange(len(vertex))
@@ -117,6 +154,10 @@ def _corner_groups(mesh: ObjectMesh) -> tuple[NDArray[np.int64], int]:
         lead = leader[vertex[pending]]
         same = (np.abs(normal[pending] - normal[lead]).max(axis=1) <= NORMAL_TOLERANCE) & (
             np.abs(albedo[pending] - albedo[lead]).max(axis=1) <= ALBEDO_TOLERANCE)
+        if several:
+            same &= of_corner[pending] == of_corner[lead]
+        if tangent is not None:
+            same &= np.sum((tangent[pending] - tangent[lead]) ** 2, axis=1) <= TANGENT_TOLERANCE ** 2
         same |= pending == lead  # a corner without a finite normal still leads its own group
         number = np.zeros(len(mesh.positions), np.int64)
         if first_round:
@@ -130,9 +171,13 @@ def _corner_groups(mesh: ObjectMesh) -> tuple[NDArray[np.int64], int]:
     return group, count
 
 
-def _split(mesh: ObjectMesh, limit: EdgeLimit, warnings: list[str]) -> _Part:
-    """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined."""
-    group, count = _corner_groups(mesh)
+def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warnings: list[str]) -> _Part:
+    """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined.
+
+    material: (t,) number of each triangle's.
+    """
+    tangent = _unit_corner_tangents(mesh)
+    group, count = _corner_groups(mesh, material, tangent)
     points = np.empty((count, 3))
     points[:len(mesh.positions)] = mesh.positions
     points[group] = mesh.positions[mesh.triangles.ravel()]
@@ -143,14 +188,31 @@ def _split(mesh: ObjectMesh, limit: EdgeLimit, warnings: list[str]) -> _Part:
     normals[~degenerate] /= length[~degenerate, None]
     _replace_normals(points, triangles, normals, degenerate)
     albedo = np.clip(_mean_per_group(mesh.corner_albedo.reshape(-1, 3), group, count), 0.0, 1.0)
+    beside = Beside(np.zeros(count, np.int32), None)
+    beside.material[group] = np.repeat(material, 3)
+    if tangent is not None:
+        wanted = _mean_per_group(mesh.corner_tangents.reshape(-1, 3), group, count)
+        beside.tangents = tangent_frame(wanted, normals, quiet_pole(normals))
     matches = count == len(mesh.positions)
     if limit.longest > 0.0:
         before = len(points)
-        points, normals, albedo, triangles = refine(points, normals, albedo, triangles, limit, mesh.name)
+        points, normals, albedo, triangles = refine(points, normals, albedo, triangles, limit, mesh.name, beside)
         if len(points) != before:
             matches = False
             warnings.append(f"{mesh.name}: refined from {before} to {len(points)} receivers")
-    return _Part(points, normals, albedo.astype(np.float32), triangles, matches)
+    tangents = beside.tangents
+    if tangents is None:  # of diffuse points nobody asks
+        tangents = smooth_tangents(normals, quiet_pole(normals) if beside.material.any() else UP)
+    return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material, tangents, matches)
+
+
+def _unit_corner_tangents(mesh: ObjectMesh) -> NDArray[np.float64] | None:
+    """The wanted tangents (t * 3, 3) along the surface as unit vectors, zero where none is wanted; None if nowhere."""
+    if mesh.corner_tangents is None or not mesh.corner_tangents.any():
+        return None
+    wanted = np.nan_to_num(mesh.corner_tangents.reshape(-1, 3).astype(np.float64), posinf=0.0, neginf=0.0)
+    frame = tangent_frame(wanted, mesh.corner_normals.reshape(-1, 3).astype(np.float64))
+    return np.where(wanted.any(axis=1, keepdims=True), frame, 0.0)
 
 
 def _mean_per_group(values: NDArray[np.floating], group: NDArray[np.int64], count: int) -> NDArray[np.float64]:
@@ -175,7 +237,8 @@ def _replace_normals(points: NDArray[np.float64], triangles: NDArray[np.int32], 
     normals[both] = total[both] / length[both, None]
 
 
-def _join(objects: list[ObjectMesh], parts: list[_Part], warnings: tuple[str, ...]) -> SceneMesh:
+def _join(objects: list[ObjectMesh], parts: list[_Part], materials: tuple[SurfaceMaterial, ...],
+          warnings: tuple[str, ...]) -> SceneMesh:
     """Concatenate the parts and number their points and triangles through."""
     scene_objects, first_point, first_triangle, triangles = [], 0, 0, []
     for mesh, part in zip(objects, parts, strict=True):
@@ -190,5 +253,8 @@ def _join(objects: list[ObjectMesh], parts: list[_Part], warnings: tuple[str, ..
     joined = np.concatenate(triangles).astype(np.int32)
     loose = np.ones(first_point, bool)
     loose[joined.ravel()] = False
-    return SceneMesh(np.concatenate([p.points for p in parts]), np.concatenate([p.normals for p in parts]), joined,
-                     np.concatenate([p.albedo for p in parts]), loose, tuple(scene_objects), warnings)
+    points, normals, albedo, material, tangents = (
+        np.concatenate([getattr(p, name) for p in parts])
+        for name in ("points", "normals", "albedo", "material", "tangents"))
+    return SceneMesh(points, normals, joined, albedo, loose, material, tangents, tuple(scene_objects), materials,
+                     warnings)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +13,21 @@ from numpy.typing import NDArray
 
 from ..errors import StorageError
 
-SCHEMA = 1
+SCHEMA = 2  # highest that is read; 1: constant rows only
 CLUSTER_ATTRIBUTE = "prt_cluster"
 WEIGHTS_ATTRIBUTE = "prt_weights_"
 ALBEDO_ATTRIBUTE = "prt_albedo"
 HEADER_PROPERTY = "prt_header"
 BASES_PROPERTY = "prt_bases"
 REBAKE = "Bake the object again"
+CONSTANT_ROWS: dict[str, Any] = {"kind": "constant"}
+HEMISPHERE_KIND = "constant_and_hemisphere"
+MOST_FUNCTIONS = 100  # of order 10, the highest of any basis here
+
+
+def hemisphere_rows(functions: Sequence[int]) -> dict[str, Any]:
+    """`rows` of a header: row 0 the diffuse one, then one row per function y_i of the exit direction, i = l(l+1)+m."""
+    return {"kind": HEMISPHERE_KIND, "functions": [int(index) for index in functions]}
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,11 @@ class BakedTransfer:
 
     header: JSON-able dict (see `make_header`); cluster: (p,) int32; weights: (p, vectors) float32;
     bases: (clusters, vectors + 1, rows, columns, channels) float32, vector 0 the cluster mean;
-    albedo: (p, 3) float32; positions, normals: (p, 3) float32 world space when baked; triangles: (t, 3) int32.
+    albedo: (p, 3) float32; positions, normals: (p, 3) float32 world space when baked; triangles: (t, 3) int32;
+    tangents: (p, 3) float32 likewise, unit, orthogonal to the normals; None where the only row is the diffuse one.
+
+    Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
+    x tangent, y normal x tangent, z normal.
     """
 
     header: dict[str, Any]
@@ -38,6 +51,12 @@ class BakedTransfer:
     positions: NDArray[np.float32]
     normals: NDArray[np.float32]
     triangles: NDArray[np.int32]
+    tangents: NDArray[np.float32] | None = None
+
+    @property
+    def functions(self) -> tuple[int, ...]:
+        """The spherical harmonics y_i that rows 1, 2, ... belong to; none for diffuse transfer."""
+        return tuple(self.header.get("rows", {}).get("functions", ()))
 
     @property
     def columns(self) -> int:
@@ -51,14 +70,15 @@ def make_header(shape: tuple[int, ...], columns: dict[str, Any], rows: dict[str,
     shape: of the bases (clusters, vectors + 1, rows, columns, channels).
     """
     return {
-        "schema": SCHEMA,
+        "schema": 1 if rows.get("kind") == "constant" else SCHEMA,
         "shape": [int(s) for s in shape],
         "columns": columns,
         "rows": rows,
         "conventions": {
             "axes": "Blender world: right-handed, Z up, metres",
             "spherical_harmonics": "real, orthonormal, index l(l+1)+m, no Condon-Shortley phase",
-            "radiance": "W m^-2 sr^-1, linear Rec.709; diffuse rows are for unit albedo",
+            "radiance": "W m^-2 sr^-1, linear Rec.709; the diffuse row is for unit albedo",
+            "exit_frame": "x tangent, y normal x tangent, z normal; the exit direction points away from the surface",
         },
         **extra,
     }
@@ -74,7 +94,22 @@ def check_header(header: Any, subject: str) -> dict[str, Any]:
     shape = header.get("shape")
     if not (isinstance(shape, list) and len(shape) == 5 and all(type(s) is int and s > 0 for s in shape)):
         raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
+    _check_rows(header, subject)
     return header
+
+
+def _check_rows(header: dict[str, Any], subject: str) -> None:
+    """Raise StorageError where the rows are of no known kind or do not fit the shape."""
+    stated, count = header.get("rows"), header["shape"][2]
+    kind = stated.get("kind") if isinstance(stated, dict) else None
+    functions = stated.get("functions", []) if kind == HEMISPHERE_KIND else []
+    valid = kind in ("constant", HEMISPHERE_KIND) and isinstance(functions, list) and all(
+        type(index) is int and 0 <= index < MOST_FUNCTIONS for index in functions)
+    if not valid or len(set(functions)) != len(functions):
+        raise StorageError(subject, "the header of its baked data states no valid rows", REBAKE)
+    if count != 1 + len(functions):
+        raise StorageError(subject, "the header of its baked data states no valid shape: "
+                           f"{count} rows, of which {1 + len(functions)} are named", REBAKE)
 
 
 def parse_header(text: str, subject: str) -> dict[str, Any]:
@@ -96,19 +131,18 @@ def pack_weights(weights: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 
 def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArray], flat_bases: NDArray,
-           geometry: tuple[NDArray, NDArray, NDArray, NDArray], subject: str) -> BakedTransfer:
+           geometry: tuple[NDArray, NDArray, NDArray, NDArray], subject: str, tangents: NDArray | None = None,
+           ) -> BakedTransfer:
     """The container from stored arrays, checked against the header.
 
-    geometry: albedo, positions, normals (p, 3) and triangles (t, 3). Raises StorageError where a shape, an index or a
-    value can't be right, so that broken data is never drawn.
+    geometry: albedo, positions, normals (p, 3) and triangles (t, 3); tangents (p, 3) where rows need them. Raises
+    StorageError where a shape, an index or a value can't be right, so that broken data is never drawn.
     """
     clusters, representatives, rows, columns, channels = check_header(header, subject)["shape"]
     points, vectors = len(cluster), representatives - 1
     albedo, positions, normals, triangles = geometry
     expected = clusters * representatives * rows * columns * channels
-    rows_of = header.get("rows")
-    diffuse = isinstance(rows_of, dict) and rows_of.get("kind") == "constant"
-    if channels not in (1, 3) or round(columns ** 0.5) ** 2 != columns or (diffuse and rows != 1):
+    if channels not in (1, 3) or round(columns ** 0.5) ** 2 != columns:
         raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
     if flat_bases.size != expected:
         raise StorageError(subject, f"its bases hold {flat_bases.size} numbers instead of {expected}", REBAKE)
@@ -118,10 +152,16 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
         raise StorageError(subject, f"the mesh has {len(positions)} points, the baked data {points}", REBAKE)
     if points and not (int(cluster.min()) >= 0 and int(cluster.max()) < clusters):
         raise StorageError(subject, "a cluster index is out of range", REBAKE)
+    if rows == 1:
+        tangents = None
+    elif tangents is None or len(tangents) != points:
+        raise StorageError(subject, "its baked data has view-dependent rows but no tangents", REBAKE)
     weights = np.concatenate([*packed_weights, np.zeros((points, 0), np.float32)], axis=1)[:, :vectors]
     bases = np.asarray(flat_bases, np.float32).reshape(clusters, representatives, rows, columns, channels)
-    if not all(np.isfinite(values).all() for values in (bases, weights, albedo, positions, normals)):
+    if not all(np.isfinite(values).all() for values in (bases, weights, albedo, positions, normals)) or (
+            tangents is not None and not np.isfinite(tangents).all()):
         raise StorageError(subject, "its baked data holds values that are not finite", REBAKE)
     return BakedTransfer(header, np.asarray(cluster, np.int32), np.asarray(weights, np.float32), bases,
                          np.asarray(albedo, np.float32), np.asarray(positions, np.float32),
-                         np.asarray(normals, np.float32), np.asarray(triangles, np.int32))
+                         np.asarray(normals, np.float32), np.asarray(triangles, np.int32),
+                         None if tangents is None else np.asarray(tangents, np.float32))

@@ -3,4 +3,5 @@
 
 A fill is a generator that yields its progress (0..1) and returns its arrays, so that a bake can report, be cancelled
 and stream. Diffuse fills: `direct` (shadowed) and `interreflection` (bounces through the `gather` operator).
+`subsurface` takes their transfer through a translucent body.
 """

@@ -29,17 +29,19 @@ DIRECTIONS = 128
 RINGS = 2
 
 
-def buried_receivers(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], white: NDArray[np.floating],
+def buried_receivers(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, white: NDArray[np.floating],
                      ) -> NDArray[np.int64]:
-    """Those of the receivers `keys` that lie inside a body. white: (k,) their radiance in a white unit environment."""
-    dark = keys[white < DARK]
-    if not len(dark):
-        return dark
-    receivers = ReceiverSet.of_keys(scene, tracer, dark)
+    """Keys of those receivers that lie inside a body, sorted. white: (r,) their radiance in a white unit environment.
+    """
+    receivers = receivers.taken(np.flatnonzero(white < DARK))
+    if not len(receivers):
+        return receivers.key
     directions = quadrature(DIRECTIONS, 2)[0].astype(np.float32)
     cosines = facing_cosines(directions, receivers.normals)
     covered = np.zeros(len(receivers))
-    owner, reach = _objects_of_triangles(scene), NEAR * _longest_edges(scene) / tracer.diagonal
+    several = len(scene.objects) > 1  # one object alone touches nothing
+    owner = _objects_of_triangles(scene)
+    reach = NEAR * _longest_edges(scene) / tracer.diagonal if several else np.zeros(len(scene.points))
     point = receivers.key % len(scene.points)
     own = _objects_of_points(scene)[point]
     for index, direction in enumerate(directions):
@@ -72,14 +74,17 @@ def _longest_edges(scene: SceneMesh) -> NDArray[np.float64]:
     return longest
 
 
-def fill_buried(scene: SceneMesh, buried: NDArray[np.int64], transfer: NDArray[np.float32]) -> int:
+def fill_buried(triangles: NDArray[np.int32], loose: NDArray[np.bool_], buried: NDArray[np.int64],
+                transfer: NDArray[np.float32]) -> int:
     """Give buried receivers at the rim the mean transfer of their open neighbours, in place; return how many.
 
-    transfer: (points, columns, channels). Neighbours share an edge; the second ring takes the first ring's values.
+    triangles: (t, 3) of an object, loose: (p,), buried: (b,) places, transfer: (p, ...), all of the same points.
+    Neighbours share an edge; the second ring takes the first ring's values.
     """
-    open_points = ~scene.loose
+    open_points = ~loose
     open_points[buried] = False
-    edges = np.concatenate([scene.triangles[:, [0, 1]], scene.triangles[:, [1, 2]], scene.triangles[:, [2, 0]]])
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    edges = edges[~open_points[edges].all(axis=1)]
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     filled = 0
     for _ in range(RINGS):
@@ -89,7 +94,7 @@ def fill_buried(scene: SceneMesh, buried: NDArray[np.int64], transfer: NDArray[n
         points, place = np.unique(rim[:, 0], return_inverse=True)
         total = np.zeros((len(points), *transfer.shape[1:]))
         np.add.at(total, place, transfer[rim[:, 1]])
-        transfer[points] = total / np.bincount(place)[:, None, None]
+        transfer[points] = total / np.bincount(place).reshape(-1, *[1] * (transfer.ndim - 1))
         open_points[points] = True
         filled += len(points)
     return filled

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..basis.spherical_harmonics import evaluate, expand_bands, zonal_cosine
 from ..linear_algebra import multiply
 from ..tracing.tracer import Tracer
+from .hemisphere_visibility import HemisphereVisibility
 from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated, weigh_by_faces
 
 # Directions per task: long enough to hide a task's overhead behind 64 x 32,000 rays, short enough to cancel at once.
@@ -27,6 +28,7 @@ class _Task:
     block: Block
     directions: NDArray[np.float32]
     weighted_basis: NDArray[np.float32]
+    weights: NDArray[np.float64]
 
 
 def unshadowed_transfer(normals: NDArray[np.float64], order: int) -> NDArray[np.float64]:
@@ -37,11 +39,13 @@ def unshadowed_transfer(normals: NDArray[np.float64], order: int) -> NDArray[np.
 
 def direct_transfer(tracer: Tracer, receivers: ReceiverSet, directions: NDArray[np.float64],
                     weights: NDArray[np.float64], order: int, group: int = 0, seed: int = 0,
-                    shadow_rays: bool = True) -> Generator[float, None, NDArray[np.float32]]:
+                    shadow_rays: bool = True, plain: HemisphereVisibility | None = None,
+                    ) -> Generator[float, None, NDArray[np.float32]]:
     """Yield progress, return transfer (r, order^2) float32 of the receivers in their order.
 
     directions (d, 3), weights (d,): a quadrature of the sphere. group: see `blocks`. shadow_rays: False where nothing
-    can be hit (a lone convex mesh): only the faces' own horizons count then.
+    can be hit (a lone convex mesh): only the faces' own horizons count then. plain: collects the visibility itself from
+    the same rays, for the receivers whose glossy rows need it.
     The quadrature's own error on the unshadowed cosine is known exactly, so it is taken out in proportion to what the
     receiver sees (a control variate): an open receiver is exact at any number of directions.
     """
@@ -51,10 +55,14 @@ def direct_transfer(tracer: Tracer, receivers: ReceiverSet, directions: NDArray[
     total = max(1, len(receivers) * len(directions))
     done = 0
 
-    def trace(task: _Task) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        return _cosine_visibility(tracer if shadow_rays else None, receivers, task.block.receivers, task.directions)
+    def trace(task: _Task) -> tuple:
+        place = task.block.receivers
+        traced = _cosine_visibility(tracer if shadow_rays else None, receivers, place, task.directions)
+        return traced, plain and plain.sample(receivers, place, task.directions, task.weights, *traced[:2])
 
-    for task, (cosines, visible, rays) in tracer.map_in_order(trace, tasks):
+    for task, ((cosines, visible, rays), sample) in tracer.map_in_order(trace, tasks):
+        if sample is not None:
+            plain.add(sample)
         place = task.block.receivers
         _accumulate(coefficients, place, task.weighted_basis, visible)
         _accumulate(unshadowed, place, task.weighted_basis, cosines)
@@ -73,7 +81,7 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
         for start in range(0, len(directions), CHUNK):
             chunk = slice(start, start + CHUNK)
             yield _Task(block, np.ascontiguousarray(turned[chunk], np.float32),
-                        np.ascontiguousarray(basis[:, chunk]))
+                        np.ascontiguousarray(basis[:, chunk]), weights[chunk])
 
 
 def _cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
@@ -83,16 +91,17 @@ def _cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: sli
     tracer: None where nothing can be hit.
     """
     cosines = facing_cosines(directions, receivers.normals[place])
-    visible = cosines.copy()
+    visible, rays = cosines.copy(), 0
+    if tracer is not None:
+        facing_pairs, origins = cosines > 0.0, receivers.origins[place]
+        for index in range(len(directions)):
+            facing = np.flatnonzero(facing_pairs[index])
+            rays += len(facing)
+            hit = tracer.occluded(np.take(origins, facing, axis=0), directions[index:index + 1])
+            visible[index, facing[hit]] = 0.0
+    # After tracing, when most pairs near the horizon are known to be dark: of the Buddha's one in seven is left, and
+    # weighing all of them before would spare one ray in seven hundred.
     weigh_by_faces(receivers, place, directions, visible)
-    if tracer is None:
-        return cosines, visible, 0
-    origins, rays = receivers.origins[place], 0
-    for index in range(len(directions)):
-        facing = np.flatnonzero(visible[index])
-        rays += len(facing)
-        hit = tracer.occluded(np.take(origins, facing, axis=0), directions[index:index + 1])
-        visible[index, facing[hit]] = 0.0
     return cosines, visible, rays
 
 

@@ -18,8 +18,9 @@ from scipy import sparse
 
 from ..linear_algebra import multiply
 from ..scene.scene_mesh import SceneMesh
-from ..tracing.tracer import Tracer
-from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated, weigh_by_faces
+from ..tracing.tracer import Hits, Tracer
+from .hit_record import HitRecord, HitRecorder, KeptHits
+from .receiver_set import Block, ReceiverSet, blocks, facing_cosines, rotated
 
 CHUNK = 16
 # Receivers of this many generations are traced for what they see; what the last of them sees beyond is counted as lost.
@@ -45,13 +46,20 @@ class Gather:
     back_share: float
     lost_share: float
     two_sided: bool
+    hits: HitRecord | None = None
 
 
 @dataclass(frozen=True)
 class _Task:
+    """first: the number of the first direction in the block's; solid_angles: (d,) the quadrature's weights; weights:
+    (d, b) the same, normalised for each receiver; wanted: (b,) bool, whose hits are kept (None: nobody's)."""
+
     block: Block
+    first: int
     directions: NDArray[np.float32]
+    solid_angles: NDArray[np.float64]
     weights: NDArray[np.float32]
+    wanted: NDArray[np.bool_] | None
     last_of_block: bool
 
 
@@ -62,16 +70,19 @@ class _Entries:
     row: list[NDArray[np.int64]]
     key: list[NDArray[np.int64]]
     value: list[NDArray[np.float32]]
+    kept: list[KeptHits]
 
 
 def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], directions: NDArray[np.float64],
                     weights: NDArray[np.float64], group: int = 0, seed: int = 0,
-                    ) -> Generator[float, None, Gather]:
+                    wanted: NDArray[np.bool_] | None = None) -> Generator[float, None, Gather]:
     """Yield progress, return the operator over the receivers `keys` and all those that they see in turn.
 
     directions, weights: a quadrature of the sphere; each receiver uses the part in its hemisphere, normalised so that
-    the cosine integrates to one (a closed room has row sums of exactly one: no energy is made or lost).
+    the cosine integrates to one (a closed room has row sums of exactly one: no energy is made or lost). wanted:
+    (2 * points,) bool by key, whose hits are kept (glossy receivers', for their indirect light).
     """
+    recorder = None if wanted is None else HitRecorder(wanted)
     sets: list[ReceiverSet] = []
     rows: list[sparse.csr_matrix] = []
     count = len(scene.points)
@@ -82,7 +93,7 @@ def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], d
         known[new] = True
         receivers = ReceiverSet.of_keys(scene, tracer, new)
         part = yield from _trace(tracer, scene, receivers, directions, weights, group, seed + generation,
-                                 generation == 0)
+                                 generation == 0, recorder)
         sets.append(receivers)
         rows.append(part)
         seen = np.zeros(len(known), bool)
@@ -97,7 +108,8 @@ def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], d
             break
     receivers = ReceiverSet.joined(sets)
     matrix, lost_share = _square(receivers.key, sparse.vstack(rows, format="csr"))
-    return Gather(receivers, matrix, hit_share, back_share, lost_share, back_share > BACKS_IGNORED)
+    return Gather(receivers, matrix, hit_share, back_share, lost_share, back_share > BACKS_IGNORED,
+                  None if recorder is None else recorder.result())
 
 
 def _square(key: NDArray[np.int64], wide: sparse.csr_matrix) -> tuple[sparse.csr_matrix, float]:
@@ -115,33 +127,39 @@ def _square(key: NDArray[np.int64], wide: sparse.csr_matrix) -> tuple[sparse.csr
 
 
 def _trace(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, directions: NDArray[np.float64],
-           weights: NDArray[np.float64], group: int, seed: int, report: bool,
+           weights: NDArray[np.float64], group: int, seed: int, report: bool, recorder: HitRecorder | None,
            ) -> Generator[float, None, sparse.csr_matrix]:
     """The operator's rows of these receivers, with keys as columns: (r, 2 points)."""
     finished: list[sparse.csr_matrix] = []
-    entries = _Entries([], [], [])
+    entries = _Entries([], [], [], [])
     done, total = 0, max(1, len(receivers) * len(directions))
 
     def trace(task: _Task) -> tuple[_Entries, int]:
         return _hits(tracer, scene, receivers, task)
 
-    for task, (found, rays) in tracer.map_in_order(trace, _tasks(receivers, directions, weights, group, seed)):
+    wanted = None if recorder is None else recorder.wanted[receivers.key]
+    tasks = _tasks(receivers, directions, weights, group, seed, wanted)
+    for task, (found, rays) in tracer.map_in_order(trace, tasks):
         entries.row += found.row
         entries.key += found.key
         entries.value += found.value
+        entries.kept += found.kept
         tracer.rays += rays
         done += (task.block.receivers.stop - task.block.receivers.start) * len(task.directions)
         if task.last_of_block:
             rows = task.block.receivers.stop - task.block.receivers.start
             finished.append(_block_matrix(entries, rows, 2 * len(scene.points)))
-            entries = _Entries([], [], [])
+            if recorder is not None:
+                turned = rotated(directions, task.block.rotation).astype(np.float32)
+                recorder.add_block(task.block, turned, entries.kept)
+            entries = _Entries([], [], [], [])
         if report:
             yield done / total
     return sparse.vstack(finished, format="csr") if finished else sparse.csr_matrix((0, 2 * len(scene.points)))
 
 
 def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDArray[np.float64], group: int,
-           seed: int) -> Iterator[_Task]:
+           seed: int, wanted: NDArray[np.bool_] | None) -> Iterator[_Task]:
     for block in blocks(len(receivers), group, seed):
         turned = np.ascontiguousarray(rotated(directions, block.rotation), np.float32)
         # In double, for normalised rows: the sum over the hemisphere is the same whatever the chunk.
@@ -152,26 +170,43 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
         scale = (1.0 / np.maximum(cosines, np.finfo(np.float64).tiny)).astype(np.float32)
         for start in range(0, len(turned), CHUNK):
             chunk = slice(start, start + CHUNK)
-            yield _Task(block, turned[chunk], weights[chunk, None].astype(np.float32) * scale,
-                        start + CHUNK >= len(turned))
+            yield _Task(block, start, turned[chunk], weights[chunk], weights[chunk, None].astype(np.float32) * scale,
+                        None if wanted is None else wanted[block.receivers], start + CHUNK >= len(turned))
 
 
 def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task) -> tuple[_Entries, int]:
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
     cosines = facing_cosines(task.directions, receivers.normals[place])
-    weigh_by_faces(receivers, place, task.directions, cosines)
-    which, row = np.nonzero(cosines)
+    which, row = np.nonzero(cosines > 0.0)
     rays = len(row)
     hits = tracer.nearest(np.take(receivers.origins[place], row, axis=0), np.take(task.directions, which, axis=0))
     met = np.flatnonzero(hits.triangle >= 0)
     which, row = which[met], row[met]
-    share = cosines[which, row] * task.weights[which, row]
+    share = cosines[which, row]
+    above = np.ones(len(met), np.float32)
+    low = np.flatnonzero(share < receivers.grazing[place][row])
+    above[low] = receivers.above_faces(row[low] + place.start, task.directions[which[low]])
+    share *= above * task.weights[which, row]
+    seen = np.flatnonzero(share)
+    met, which, row, share, above = met[seen], which[seen], row[seen], share[seen], above[seen]
     side = np.where(hits.front[met], 0, len(scene.points))
     corner = scene.triangles[hits.triangle[met]].astype(np.int64) + side[:, None]
     u, v = hits.u[met], hits.v[met]
     value = (np.stack([1.0 - u - v, u, v], axis=1) * share[:, None]).astype(np.float32)
-    return _Entries([np.repeat(row, 3)], [corner.ravel()], [value.ravel()]), rays
+    kept = [] if task.wanted is None or not task.wanted.any() else _kept(task, hits, met, which, row, share, above)
+    return _Entries([np.repeat(row, 3)], [corner.ravel()], [value.ravel()], kept), rays
+
+
+def _kept(task: _Task, hits: Hits, met: NDArray[np.int64], which: NDArray[np.int64], row: NDArray[np.int64],
+          share: NDArray[np.float32], above: NDArray[np.float32]) -> list[KeptHits]:
+    """The hits (numbers `met` of the rays, in directions `which` from receivers `row`) of the wanted receivers. above:
+    share of the receiver's faces below the direction."""
+    chosen = np.flatnonzero(task.wanted[row])
+    met, which, row = met[chosen], which[chosen], row[chosen]
+    solid_angle = (above[chosen] * task.solid_angles[which]).astype(np.float32)
+    return [KeptHits(row, which + task.first, hits.triangle[met], hits.u[met], hits.v[met], hits.front[met],
+                     solid_angle, share[chosen])]
 
 
 def _block_matrix(entries: _Entries, rows: int, columns: int) -> sparse.csr_matrix:

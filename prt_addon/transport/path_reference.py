@@ -22,7 +22,8 @@ from .receiver_set import ReceiverSet
 
 # After this many bounces a path goes on with the probability of its albedo (Russian roulette).
 SURE_BOUNCES = 4
-PATHS_AT_ONCE = 1 << 18
+# Paths of one task: their numbers stay in the processor's cache, and a few receivers already fill every core.
+PATHS_AT_ONCE = 1 << 15
 # Rays leave a hit this far above it, as a multiple of LIFT: a hit's own position is known to a few units in the last
 # place, not exactly as a vertex's.
 HIT_LIFT = 4.0
@@ -69,25 +70,29 @@ def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet,
     albedo: (points, 3) that surfaces bounce with. emission may return several values per direction; sun light is added
     to the last one. paths: per receiver, both halves together. bounces: most bounces, -1 for all (Russian roulette).
     """
-    generator = np.random.Generator(np.random.PCG64(seed))
     half = max(1, paths // 2)
-    result: list[NDArray[np.float64]] = []
     at_once = max(1, PATHS_AT_ONCE // half)
-    for which in range(2):
-        parts = []
-        for start in range(0, len(receivers), at_once):
-            part = slice(start, min(start + at_once, len(receivers)))
-            parts.append(_half(tracer, scene, receivers, part, albedo, emission, suns, half, bounces, generator))
-            yield (which + part.stop / len(receivers)) / 2
-        result.append(np.concatenate(parts))
-    return np.stack(result)
+    parts = [(which, slice(start, min(start + at_once, len(receivers))))
+             for which in range(2) for start in range(0, len(receivers), at_once)]
+    result: list[list[NDArray[np.float64]]] = [[], []]
+
+    def trace(task: tuple[int, slice]) -> tuple[NDArray[np.float64], int]:
+        # Random numbers of the part's own, so that the result is the same for any number of threads.
+        generator = np.random.Generator(np.random.PCG64([seed, task[0], task[1].start]))
+        return _half(tracer, scene, receivers, task[1], albedo, emission, suns, half, bounces, generator)
+
+    for (which, part), (found, rays) in tracer.map_in_order(trace, parts):
+        result[which].append(found)
+        tracer.rays += rays
+        yield (which + part.stop / len(receivers)) / 2
+    return np.stack([np.concatenate(half_result) for half_result in result])
 
 
 def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice, albedo: NDArray[np.float32],
           emission: Emission, suns: DistantSuns, count: int, bounces: int, generator: np.random.Generator,
-          ) -> NDArray[np.float64]:
-    """Mean over `count` paths from each receiver of the part: (receivers, values, 3)."""
-    number = part.stop - part.start
+          ) -> tuple[NDArray[np.float64], int]:
+    """Mean over `count` paths from each receiver of the part, (receivers, values, 3), and the rays traced."""
+    number, rays = part.stop - part.start, 0
     values = emission(np.array([[0.0, 0.0, 1.0]])).shape[1]
     total = np.zeros((number, values, 3))
     paths = _Paths(np.repeat(np.arange(number), count), np.repeat(receivers.origins[part], count, axis=0),
@@ -95,11 +100,11 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
     first = _stratified(number, count, generator)
     depth = 0
     while len(paths.owner):
-        _add_suns(tracer, receivers, part, paths, suns, total, generator)
+        rays += _add_suns(tracer, receivers, part, paths, suns, total, generator)
         directions = _cosine_directions(paths.normals, first if depth == 0 else generator.random((len(paths.owner), 2)))
         paths, directions = _above_surface(receivers, part, paths, directions, depth)
         hits = tracer.nearest(paths.origins, directions)
-        tracer.rays += len(directions)
+        rays += len(directions)
         escaped = hits.triangle < 0
         brought = emission(directions[escaped].astype(np.float64)) * paths.throughput[escaped, None, :]
         np.add.at(total, paths.owner[escaped], brought)
@@ -108,7 +113,7 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
         paths = _next(tracer, scene, paths, directions, hits, albedo)
         paths = _roulette(paths, generator) if depth >= SURE_BOUNCES else paths
         depth += 1
-    return total / count
+    return total / count, rays
 
 
 def _above_surface(receivers: ReceiverSet, part: slice, paths: _Paths, directions: NDArray[np.float32], depth: int,
@@ -137,8 +142,9 @@ def _cosine_directions(normals: NDArray[np.float64], numbers: NDArray[np.float64
 
 
 def _add_suns(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths, suns: DistantSuns,
-              total: NDArray[np.float64], generator: np.random.Generator) -> None:
-    """Add each sun's reflected light at the paths' surfaces to the last emission value."""
+              total: NDArray[np.float64], generator: np.random.Generator) -> int:
+    """Add each sun's reflected light at the paths' surfaces to the last emission value; return the rays traced."""
+    rays = 0
     for direction, irradiance, angle in zip(suns.directions, suns.irradiance, suns.angles, strict=True):
         towards, scale = _disc_directions(direction, float(angle), len(paths.owner), generator)
         cosine = np.sum(paths.normals * towards, axis=1)
@@ -148,9 +154,10 @@ def _add_suns(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths
             cosine *= np.sum(paths.faces * towards, axis=1) > 0.0
         facing = np.flatnonzero(cosine > 0.0)
         seen = facing[~tracer.occluded(paths.origins[facing], towards[facing].astype(np.float32))]
-        tracer.rays += len(facing)
+        rays += len(facing)
         np.add.at(total[:, -1], paths.owner[seen],
                   paths.throughput[seen] * (scale * cosine[seen, None] / np.pi) * irradiance)
+    return rays
 
 
 def _disc_directions(direction: NDArray[np.float64], angle: float, count: int, generator: np.random.Generator,

@@ -114,8 +114,13 @@ def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.Wo
     return world
 
 
+# Everything that a camera sees of a surface, colours included.
+ALL_LIGHT = {"DIRECT", "INDIRECT", "DIFFUSE", "GLOSSY", "TRANSMISSION", "EMIT"}
+
+
 def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) -> np.ndarray:
-    """Unit-albedo exit radiance (v, 3) of an object's vertices under the scene's light, baked by Cycles."""
+    """Exit radiance (v, 3) of an object's vertices under the scene's light, baked by Cycles: for unit albedo and of
+    diffuse light, or, with ALL_LIGHT, all of it towards the scene's camera."""
     mesh = thing.data
     attribute = mesh.color_attributes.get("bake") or mesh.color_attributes.new("bake", "FLOAT_COLOR", "POINT")
     mesh.color_attributes.active_color = attribute
@@ -123,9 +128,74 @@ def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) ->
     bpy.context.view_layer.objects.active = thing
     thing.select_set(True)
     bpy.context.scene.cycles.seed = seed
-    bpy.context.scene.render.bake.use_pass_color = False
-    bpy.ops.object.bake(type="DIFFUSE", pass_filter=passes, target="VERTEX_COLORS", use_clear=True)
+    bake = bpy.context.scene.render.bake
+    bake.use_pass_color, bake.view_from = False, "ACTIVE_CAMERA" if passes == ALL_LIGHT else "ABOVE_SURFACE"
+    bpy.ops.object.bake(type="COMBINED" if passes == ALL_LIGHT else "DIFFUSE", pass_filter=passes,
+                        target="VERTEX_COLORS", use_clear=True)
     colours = np.empty(4 * len(mesh.vertices), np.float32)
     mesh.color_attributes["bake"].data.foreach_get("color", colours)
     mesh.color_attributes.remove(mesh.color_attributes["bake"])
     return colours.reshape(-1, 4)[:, :3].astype(np.float64)
+
+
+def shown_radiance(thing: bpy.types.Object, passes: set[str], vertices: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Exit radiance (v, 3) that Cycles shows around some vertices of an object; passes: as for `vertex_radiance`.
+
+    A vertex bake stands on the corner itself, where Cycles leaves out only the one face that a ray starts on and lets
+    part of the light from under it through; on coarse smooth-shaded meshes no render shows that value. What a render
+    shows is the faces' insides: here a small probe lies on each face next to the vertex, with the vertex's shading
+    normal, lit by everything and hiding nothing; the vertex gets the mean over its faces by their angles. Let the world
+    be found by the surface's own samples alone (`sampling_method` NONE): Cycles starts samples of the light from under
+    a face 1e-5 away from it, which on folds of small meshes is the other side of the body.
+    """
+    probes, owner, weight = _add_probes(thing, vertices)
+    colours = vertex_radiance(probes, passes, seed).reshape(-1, 3, 3).mean(axis=1)
+    mesh = probes.data
+    bpy.data.objects.remove(probes)
+    bpy.data.meshes.remove(mesh)
+    total = np.stack([np.bincount(owner, weight * colours[:, k], len(vertices)) for k in range(3)], axis=1)
+    return total / np.bincount(owner, weight, len(vertices))[:, None]
+
+
+# Places of a probe's corners on the way from the vertex to the middle of its face and its edges' ends.
+PROBE_NEAR, PROBE_SIZE = 0.02, 0.01
+# Its height above the face, as a share of its distance to the face's edges (a higher one would look over the next face
+# of a fold) and, at least, of the object's diagonal (single precision).
+PROBE_HEIGHT, PROBE_LEAST = 0.1, 5e-7
+
+
+def _add_probes(thing: bpy.types.Object, vertices: np.ndarray) -> tuple[bpy.types.Object, np.ndarray, np.ndarray]:
+    """Probes at every triangle corner of the vertices; the place (n,) of each one's vertex and its corner's angle."""
+    mesh = thing.data
+    mesh.calc_loop_triangles()
+    triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+    points, normals = np.empty((2, len(mesh.vertices), 3), np.float32)
+    mesh.vertices.foreach_get("co", points.ravel())
+    mesh.vertex_normals.foreach_get("vector", normals.ravel())
+    points = points.astype(np.float64)
+    place = np.full(len(points), -1)
+    place[vertices] = np.arange(len(vertices))
+    face, corner = np.nonzero(place[triangles] >= 0)
+    a, b, c = (points[triangles[face, (corner + k) % 3]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    area = np.linalg.norm(across, axis=1)
+    kept = area > 1e-12 * area.max()
+    face, corner, a, b, c, across, area = (x[kept] for x in (face, corner, a, b, c, across, area))
+    cosine = np.sum((b - a) * (c - a), axis=1) / (np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1))
+    start = a + PROBE_NEAR * ((a + b + c) / 3 - a)
+    around = sum(np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c))
+    height = np.maximum(PROBE_HEIGHT * PROBE_NEAR * area / around, PROBE_LEAST * np.linalg.norm(np.ptp(points, axis=0)))
+    start += height[:, None] * across / area[:, None]
+    corners = np.stack([start, start + PROBE_SIZE * (b - a), start + PROBE_SIZE * (c - a)], axis=1)
+    probes = bpy.data.meshes.new("Probes")
+    probes.from_pydata(corners.reshape(-1, 3).tolist(), [], np.arange(3 * len(a)).reshape(-1, 3).tolist())
+    probes.polygons.foreach_set("use_smooth", np.ones(len(a), bool))
+    owner = triangles[face, corner]
+    probes.normals_split_custom_set(np.repeat(normals[owner], 3, axis=0).tolist())
+    probes.materials.append(mesh.materials[0])
+    added = bpy.data.objects.new("Probes", probes)
+    bpy.context.scene.collection.objects.link(added)
+    added.matrix_world = thing.matrix_world
+    added.visible_shadow = False
+    return added, place[owner], np.arccos(np.clip(cosine, -1.0, 1.0))

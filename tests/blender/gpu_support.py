@@ -59,24 +59,41 @@ def made_up_bake(
     channels: int = 1,
     rows: int = 1,
     columns: int = 25,
+    functions: tuple[int, ...] = (),
 ) -> Any:
-    """A BakedTransfer with random numbers in every place: nothing that the shaders must not mix up is equal."""
-    from prt.prt_addon.storage.container import BakedTransfer, make_header
+    """A BakedTransfer with random numbers in every place: nothing that the shaders must not mix up is equal.
 
-    count = len(points)
+    functions: of the view; they bring rows, normals that lean by up to 30 degrees and tangents with them.
+    """
+    from prt.prt_addon.storage.container import BakedTransfer, hemisphere_rows, make_header
+
+    count, rows = len(points), rows + len(functions)
     shape = (clusters, vectors + 1, rows, columns, channels)
     bases = generator.normal(0.0, 0.02, shape)
-    bases[:, 0, :, 0] += 1.0  # bright enough under `bright_light` that nothing is clipped at black
+    # Bright enough under `bright_light` that nothing is clipped at black.
+    bases[:, 0, : rows - len(functions), 0] += 1.0
+    rows_header = hemisphere_rows(functions) if functions else {"kind": "constant"}
+    normals, tangents = leaning_frames(count, generator) if functions else (np.tile((0.0, 0.0, 1.0), (count, 1)), None)
     return BakedTransfer(
-        header=make_header(shape, {"kind": "spherical_harmonics", "order": round(columns**0.5)}, {"kind": "constant"}),
+        header=make_header(shape, {"kind": "spherical_harmonics", "order": round(columns**0.5)}, rows_header),
         cluster=generator.integers(0, clusters, count).astype(np.int32),
         weights=generator.uniform(-1.0, 1.0, (count, vectors)).astype(np.float32),
         bases=bases.astype(np.float32),
         albedo=generator.uniform(0.1, 0.9, (count, 3)).astype(np.float32),
         positions=points,
-        normals=np.tile(np.array([0, 0, 1], np.float32), (count, 1)),
+        normals=normals.astype(np.float32),
         triangles=triangles,
+        tangents=None if tangents is None else tangents.astype(np.float32),
     )
+
+
+def leaning_frames(count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals within 30 degrees of z and tangents orthogonal to them, (count, 3) each."""
+    normals = np.concatenate([generator.uniform(-0.4, 0.4, (count, 2)), np.ones((count, 1))], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    across = np.stack([generator.uniform(-0.5, 0.5, count), np.ones(count), np.zeros(count)], axis=1)
+    tangents = np.cross(across, normals)
+    return normals, tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
 
 
 def bright_light(columns: int, generator: np.random.Generator) -> np.ndarray:

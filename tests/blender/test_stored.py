@@ -16,7 +16,7 @@ from prt_addon.blender import fingerprint, stored
 from prt_addon.blender.read_scene import read_objects
 from prt_addon.errors import StorageError
 from prt_addon.scene.scene_mesh import SceneMesh
-from prt_addon.storage.container import BakedTransfer, make_header
+from prt_addon.storage.container import BakedTransfer, hemisphere_rows, make_header
 from tests.blender.scenes import add_cube, depsgraph, place, user_data_lines
 
 CLUSTERS, VECTORS, COLUMNS = 3, 6, 16
@@ -30,15 +30,16 @@ def add_smooth_sphere(name: str = "Sphere") -> bpy.types.Object:
     return bpy.context.object
 
 
-def bake_of(scene_object: bpy.types.Object, seed: int = 0) -> BakedTransfer:
-    """A made-up bake on the receivers that the scene really gives this object."""
+def bake_of(scene_object: bpy.types.Object, seed: int = 0, functions: tuple[int, ...] = ()) -> BakedTransfer:
+    """A made-up bake on the receivers that the scene really gives this object. functions: of the view, if any."""
     graph = depsgraph()
     assembled = SceneMesh.assemble(read_objects(graph, [scene_object.name]))
     share = next(o for o in assembled.objects if o.name == scene_object.name_full)
     random, count = np.random.default_rng(seed), share.points.stop - share.points.start
-    bases = random.normal(size=(CLUSTERS, VECTORS + 1, 1, COLUMNS, 3)).astype(np.float32)
+    bases = random.normal(size=(CLUSTERS, VECTORS + 1, 1 + len(functions), COLUMNS, 3)).astype(np.float32)
     header = make_header(
-        bases.shape, {"kind": "spherical_harmonics", "order": 4, "condon_shortley": False}, {"kind": "constant"},
+        bases.shape, {"kind": "spherical_harmonics", "order": 4, "condon_shortley": False},
+        hemisphere_rows(functions) if functions else {"kind": "constant"},
         object=scene_object.name, vectors_per_cluster=[VECTORS] * CLUSTERS, digests={"settings": "abc"},
         source={"object": scene_object.name, "on_source_mesh": share.matches_source},
         matrix=[float(v) for v in share.matrix.ravel()])
@@ -46,7 +47,8 @@ def bake_of(scene_object: bpy.types.Object, seed: int = 0) -> BakedTransfer:
         header, random.integers(0, CLUSTERS, count).astype(np.int32),
         random.normal(size=(count, VECTORS)).astype(np.float32), bases, assembled.albedo[share.points],
         assembled.points[share.points].astype(np.float32), assembled.normals[share.points].astype(np.float32),
-        (assembled.triangles[share.triangles] - share.points.start).astype(np.int32))
+        (assembled.triangles[share.triangles] - share.points.start).astype(np.int32),
+        assembled.tangents[share.points].astype(np.float32) if functions else None)
 
 
 def assert_same(read: BakedTransfer | None, written: BakedTransfer) -> None:
@@ -58,6 +60,10 @@ def assert_same(read: BakedTransfer | None, written: BakedTransfer) -> None:
     size = np.abs(written.positions).max()
     assert np.allclose(read.positions, written.positions, atol=2e-6 * size)
     assert np.allclose(read.normals, written.normals, atol=1e-4)
+    assert (read.tangents is None) == (written.tangents is None)
+    if written.tangents is not None:
+        assert np.allclose(read.tangents, written.tangents, atol=1e-4)
+        assert np.abs(np.sum(read.tangents * read.normals, axis=1)).max() < 1e-6
     assert {_turned(t) for t in read.triangles.tolist()} == {_turned(t) for t in written.triangles.tolist()}
 
 
@@ -106,6 +112,74 @@ def test_roundtrip_under_any_transform(scene: bpy.types.Scene, make: Callable[..
     assert (mesh == scene_object.data) == (make is add_smooth_sphere)
     assert_same(stored.read_baked(scene_object), baked)
     assert stored.stale(scene_object, depsgraph()) is None
+
+
+ROW_SETS = {"subsurface": (0,), "9": tuple(range(9)), "24": (0, 1, *range(3, 25)), "25": tuple(range(25))}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.parametrize("make", [add_smooth_sphere, add_cube], ids=["own mesh", "receiver"])
+def test_view_dependent_rows_and_tangents_come_back(scene: bpy.types.Scene, make: Callable[..., object],
+                                                    transform: str) -> None:
+    scene_object = make()
+    place(scene_object, TRANSFORMS[transform])
+    baked = bake_of(scene_object, functions=ROW_SETS["9"])
+    mesh = stored.write_baked(scene_object, baked)
+    tangent = mesh.attributes["prt_tangent"]
+    assert (tangent.data_type, tangent.domain) == ("FLOAT_VECTOR", "POINT")
+    assert json.loads(mesh["prt_header"])["schema"] == 2
+    assert_same(stored.read_baked(scene_object), baked)
+    stored.write_baked(scene_object, bake_of(scene_object))
+    assert "prt_tangent" not in stored.baked_mesh(scene_object).attributes
+    assert stored.read_baked(scene_object).functions == ()
+
+
+@pytest.mark.parametrize("rows", ROW_SETS)
+def test_view_dependent_rows_survive_save_and_load(scene: bpy.types.Scene, rows: str, tmp_path: Path) -> None:
+    sphere = add_smooth_sphere()
+    baked = bake_of(sphere, functions=ROW_SETS[rows])
+    stored.write_baked(sphere, baked)
+    path = str(tmp_path / "baked.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    read = stored.read_baked(bpy.data.objects["Sphere"])
+    assert read.functions == ROW_SETS[rows]
+    assert_same(read, baked)
+
+
+def _rows(**changes: object) -> dict:
+    return {"kind": "constant_and_hemisphere", "functions": list(range(9)), **changes}
+
+
+ROW_DAMAGE = {
+    "unknown kind": (lambda m: _set_header(m, rows=_rows(kind="mystery")), "rows"),
+    "no rows": (lambda m: _set_header(m, rows=None), "rows"),
+    "one too few": (lambda m: _set_header(m, rows=_rows(functions=list(range(8)))), "10 rows"),
+    "twice": (lambda m: _set_header(m, rows=_rows(functions=[0] * 9)), "rows"),
+    "out of range": (lambda m: _set_header(m, rows=_rows(functions=[*range(8), 100])), "rows"),
+    "negative": (lambda m: _set_header(m, rows=_rows(functions=[*range(8), -1])), "rows"),
+    "no number": (lambda m: _set_header(m, rows=_rows(functions=[*range(8), "8"])), "rows"),
+    "no list": (lambda m: _set_header(m, rows=_rows(functions="012345678")), "rows"),
+    "lost tangents": (lambda m: m.attributes.remove(m.attributes["prt_tangent"]), "prt_tangent"),
+}
+
+
+@pytest.mark.parametrize("damage", ROW_DAMAGE)
+def test_damaged_rows_are_refused(scene: bpy.types.Scene, damage: str) -> None:
+    sphere = add_smooth_sphere()
+    mesh = stored.write_baked(sphere, bake_of(sphere, functions=ROW_SETS["9"]))
+    spoil, words = ROW_DAMAGE[damage]
+    spoil(mesh)
+    with pytest.raises(StorageError, match=words):
+        stored.read_baked(sphere)
+
+
+def test_a_bake_without_its_tangents_is_not_written(scene: bpy.types.Scene) -> None:
+    sphere = add_smooth_sphere()
+    baked = bake_of(sphere, functions=ROW_SETS["9"])
+    with pytest.raises(StorageError, match="no tangents"):
+        stored.write_baked(sphere, BakedTransfer(**{**baked.__dict__, "tangents": None}))
+    assert stored.baked_mesh(sphere) is None
 
 
 def test_receiver_is_a_hidden_child_in_place(scene: bpy.types.Scene) -> None:
@@ -313,7 +387,7 @@ def _set_header(mesh: bpy.types.Mesh, **changes: object) -> None:
 
 
 DAMAGE = {
-    "newer schema": (lambda m: _set_header(m, schema=2), "schema 2"),
+    "newer schema": (lambda m: _set_header(m, schema=3), "schema 3"),
     "no json": (lambda m: m.__setitem__("prt_header", "{"), "not readable"),
     "lost attribute": (lambda m: m.attributes.remove(m.attributes["prt_weights_1"]), "prt_weights_1"),
     "lost bases": (lambda m: m.__delitem__("prt_bases"), "no bases"),
@@ -334,7 +408,7 @@ def test_damaged_or_newer_data_is_refused(scene: bpy.types.Scene, damage: str) -
         stored.read_baked(sphere)
     assert caught.value.subject == "Sphere"
     if damage == "newer schema":
-        with pytest.raises(StorageError, match="schema 2"):
+        with pytest.raises(StorageError, match="schema 3"):
             stored.stale(sphere, depsgraph())
     assert stored.clear_baked(sphere)
 

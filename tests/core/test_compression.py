@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import linalg
 from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
 
@@ -378,3 +379,23 @@ def test_overdraw_counts_clusters_of_triangles() -> None:
     assert overdraw(triangles, np.array([0, 0, 0, 0, 0, 0])) == 1
     assert overdraw(triangles, np.array([0, 0, 0, 1, 2, 0])) == pytest.approx((1 + 2 + 3) / 3)
     assert overdraw(np.zeros((0, 3), int), np.array([0])) == 1
+
+
+@pytest.mark.parametrize("rows", [None, 4])
+def test_a_very_wide_signal_is_encoded_on_its_leading_axes_with_nothing_lost_in_the_count(rows, monkeypatch):
+    """Beyond WIDE values only leading axes are found: the error stated is still the true one, the result as good."""
+    generator = np.random.default_rng(5)
+    signal = (generator.normal(size=(700, 40)) * 0.8 ** np.arange(40)) @ generator.normal(size=(40, 240))
+    signal = (signal + 1e-4 * generator.normal(size=signal.shape) + 0.3).astype(np.float32)
+    metric = None if rows is None else np.diag(np.arange(1.0, rows + 1)) + 0.2
+    settings = EncoderSettings(6, 4, "iterative", 1)
+    exact = encode(signal, settings, metric)
+    for name, value in (("WIDE", 100), ("FIRST_WIDTH", 20), ("MOST_WIDTH", 60)):
+        monkeypatch.setattr(f"prt_addon.compression.global_frame.{name}", value)
+    found = encode(signal, settings, metric)
+    assert found.bases.shape[2] == 240
+    root = np.eye(1) if rows is None else linalg.sqrtm(metric).real
+    difference = (found.decode().astype(np.float64) - signal).reshape(700, len(root), -1)
+    true = float(np.sum((root[None] @ difference) ** 2))
+    assert found.squared_error == pytest.approx(true, rel=1e-3)
+    assert found.squared_error < 1.05 * exact.squared_error

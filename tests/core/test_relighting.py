@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import sph_harm_y
 
-from prt_addon.relighting.exit_radiance import cluster_constants, diffuse_radiance, exit_radiance
+from prt_addon.relighting.exit_radiance import cluster_constants, diffuse_radiance, exit_radiance, view_radiance
 
 
 def random_baked(points: int, clusters: int, vectors: int, rows: int, columns: int, channels: int) -> SimpleNamespace:
@@ -93,3 +94,48 @@ def test_fifty_thousand_points_take_milliseconds() -> None:
         diffuse_radiance(baked, baked.light)
         seconds.append(time.perf_counter() - start)
     assert min(seconds) < 0.1  # 4-10 ms measured; the limit leaves room for a busy machine
+
+
+def glossy_baked(points: int, functions: tuple[int, ...]) -> SimpleNamespace:
+    baked = random_baked(points, 7, 3, 1 + len(functions), 9, 3)
+    random = np.random.default_rng(1)
+    frame = np.linalg.qr(random.normal(size=(points, 3, 3)))[0].transpose(0, 2, 1)
+    frame[:, 2] = np.cross(frame[:, 0], frame[:, 1])  # right-handed: tangent, bitangent, normal
+    baked.tangents, baked.normals = frame[:, 0].astype(np.float32), frame[:, 2].astype(np.float32)
+    baked.functions, baked.frame = functions, frame
+    return baked
+
+
+def real_harmonics(index: int, local: np.ndarray) -> np.ndarray:
+    """y_i from scipy's complex functions, as design/transfer.md states them."""
+    degree = int(index ** 0.5)
+    m = index - degree * (degree + 1)
+    value = sph_harm_y(degree, abs(m), np.arccos(np.clip(local[:, 2], -1, 1)), np.arctan2(local[:, 1], local[:, 0]))
+    return value.real if m == 0 else 2 ** 0.5 * (-1) ** m * (value.real if m > 0 else value.imag)
+
+
+@pytest.mark.parametrize("functions", [(0,), tuple(range(16)), (0, 1, *range(3, 25)), tuple(range(25))])
+def test_view_radiance_is_albedo_times_row_0_plus_functions_of_the_view(functions: tuple[int, ...]) -> None:
+    baked = glossy_baked(200, functions)
+    views = np.random.default_rng(3).normal(size=(200, 3)) * 5.0
+    rows = full_product(baked)
+    local = np.einsum("pij,pj->pi", baked.frame, views / np.linalg.norm(views, axis=1, keepdims=True))
+    local[:, 2] = np.abs(local[:, 2])  # views from behind are mirrored to the front
+    expected = baked.albedo * rows[:, 0]
+    for row, index in enumerate(functions, start=1):
+        expected = expected + real_harmonics(index, local)[:, None] * rows[:, row]
+    found = view_radiance(baked, baked.light, views)
+    assert found.dtype == np.float32
+    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_view_radiance_of_diffuse_transfer_and_misfits() -> None:
+    baked = glossy_baked(50, ())
+    views = np.ones((50, 3))
+    np.testing.assert_array_equal(view_radiance(baked, baked.light, views), diffuse_radiance(baked, baked.light))
+    with pytest.raises(ValueError, match="one view"):
+        view_radiance(baked, baked.light, views[:49])
+    wrong = glossy_baked(50, (0, 1, 2))
+    wrong.functions = (0, 1)
+    with pytest.raises(ValueError, match="4 rows"):
+        view_radiance(wrong, wrong.light, views)

@@ -83,18 +83,24 @@ def test_touching_box_leaks_no_light_and_leaves_no_black_rim():
     assert seen[sides].min() > 0.45  # a wall over a plane sees half the sphere's cosine: 0.5
 
 
+def found_buried(scene, seen):
+    """Keys of buried receivers, of all of the scene's."""
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    receivers = ReceiverSet.of_keys(scene, tracer, np.arange(len(scene.points)))
+    return buried_receivers(tracer, scene, receivers, seen[receivers.key])
+
+
 def test_receivers_inside_a_body_are_found_and_filled_from_outside():
     # A floor with a box standing on it: points under the box see only its inside. Its neighbours are in the open.
     scene = SceneMesh.assemble([plane(size=4.0, cells=16), box(low=(-0.6, -0.6, -0.2), high=(0.6, 0.6, 1))])
-    tracer = Tracer(scene.points, scene.triangles, 1)
     seen = direct(scene, order=1)[:, 0] * WHITE
-    buried = buried_receivers(tracer, scene, np.arange(len(scene.points)), seen)
+    buried = found_buried(scene, seen)
     floor = np.flatnonzero(scene.points[:, 2] == 0)
     inside = floor[np.abs(scene.points[floor, :2]).max(axis=1) < 0.6]
     assert set(buried) == set(inside)  # the box's lower corners stick out below the floor: in the open, not buried
     transfer = seen[:, None, None].astype(np.float32)
     assert transfer[inside].max() < 1e-6
-    assert fill_buried(scene, buried, transfer) == len(inside) - 1  # all but the innermost of 5 x 5
+    assert fill_buried(scene.triangles, scene.loose, buried, transfer) == len(inside) - 1  # not the innermost
     rim = inside[np.abs(scene.points[inside, :2]).max(axis=1) > 0.4]
     assert transfer[rim].min() > 0.4
 
@@ -102,16 +108,15 @@ def test_receivers_inside_a_body_are_found_and_filled_from_outside():
 def test_floor_under_a_hovering_body_is_filled_but_a_crevice_stays_dark():
     # 1 mm between floor and box, floor cells of 25 cm: below what the floor's receivers resolve.
     scene = SceneMesh.assemble([plane(size=4.0, cells=16), box(low=(-0.6, -0.6, 0.001), high=(0.6, 0.6, 1))])
-    tracer = Tracer(scene.points, scene.triangles, 1)
     seen = direct(scene, order=1)[:, 0] * WHITE
-    buried = buried_receivers(tracer, scene, np.arange(len(scene.points)), seen)
+    buried = found_buried(scene, seen)
     floor = np.flatnonzero(scene.points[:, 2] == 0)
     assert set(floor[np.abs(scene.points[floor, :2]).max(axis=1) < 0.6]) <= set(buried)
     # The same two bodies as one object are a crevice that the artist modelled.
     one = SceneMesh.assemble([join("one", plane(size=4.0, cells=16),
                                    box(low=(-0.6, -0.6, 0.001), high=(0.6, 0.6, 1)))])
     seen = direct(one, order=1)[:, 0] * WHITE
-    assert not len(buried_receivers(Tracer(one.points, one.triangles, 1), one, np.arange(len(one.points)), seen))
+    assert not len(found_buried(one, seen))
 
 
 def test_threads_and_chunks_change_nothing():

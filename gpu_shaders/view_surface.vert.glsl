@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// A baked surface whose radiance depends on the view: the point's rows are found by the vertex number, and its frame
+// turns the direction to the viewer, left unnormalised so that its interpolation stays exact along flat triangles.
+// Without SEES_VIEWER the constant function is the only one (subsurface light).
+void main()
+{
+  int first_texel = gl_VertexID * ROWS;
+  diffuse_radiance = texelFetch(exit_values, texel(first_texel), 0).rgb;
+  fetch_rows(first_texel);
+  surface_albedo = albedo;
+#ifdef SEES_VIEWER
+  vec3 to_viewer = viewer.xyz - viewer.w * position;
+  local_view = vec3(dot(to_viewer, tangent), dot(to_viewer, cross(normal, tangent)), dot(to_viewer, normal));
+#endif
+  gl_Position = transform * vec4(position, 1.0);
+}

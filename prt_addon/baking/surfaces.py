@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the materials of a scene ask of a bake: rows for highlights, a term for subsurface light, what is left out.
+
+Everything here is per material and done once, before the first ray; receivers look it up by their material's number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..basis.hemisphere import Indices, functions_of, gram_matrix
+from ..basis.spherical_harmonics import expand_bands
+from ..scene.needs import LeftOut
+from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..scene.surface_material import SurfaceMaterial
+from ..transport.brdf import (
+    Reflection,
+    choose_rows,
+    diffuse_left,
+    reflection_matrix,
+    reflection_of_material,
+    ringing_window,
+)
+from .settings import BakeSettings
+
+# Order of the functions that incident radiance is turned and reflected in, and the smallest eigenvalue of their Gram
+# matrix that is inverted: white metal of roughness 0.3 is then within 0.3 % of white up to 60 degrees, where order 5
+# and 1e-2 leave 3 % (receivers lack the little that faces hide at the horizon, and a narrow kernel amplifies that).
+INCIDENT_ORDER = 7
+SMALLEST_INCIDENT = 3e-2
+# The constant function y_0, through which subsurface light leaves (Sloan 2003, section 3).
+CONSTANT = 0.5 / np.sqrt(np.pi)
+# Mean square of the albedo below which a black surface's diffuse row is still kept right, for materials edited later.
+DARKEST = 1e-4
+_GREY = 1e-6
+
+
+@dataclass(frozen=True)
+class SurfacePart:
+    """How one material is held.
+
+    kernel: (rows, incident functions, 1 or 3), None where it has no rows of its own; window: (columns,) factors on the
+    light that a highlight sharper than the light's order reflects; diffuse_share: of its diffuse
+    layer that the layers above leave, a mean over views; dimming: (rows,) how that differs over views; highlight:
+    (3,) mean share of the light that its highlight returns; translucent: subsurface light is baked.
+    """
+
+    material: SurfaceMaterial
+    kernel: NDArray[np.float64] | None
+    window: NDArray[np.float64]
+    diffuse_share: float
+    dimming: NDArray[np.float64]
+    highlight: NDArray[np.float64]
+    translucent: bool
+
+
+@dataclass(frozen=True)
+class SurfacePlan:
+    """parts: by the scene's material number; functions: of the rows of every object with a highlight; left_out, hints:
+    for the report."""
+
+    parts: tuple[SurfacePart, ...]
+    functions: Indices
+    left_out: list[LeftOut] = field(default_factory=list)
+    hints: list[str] = field(default_factory=list)
+
+    def glossy_points(self, scene: SceneMesh) -> NDArray[np.bool_]:
+        """(p,) which points of targets have a highlight that is baked."""
+        return self._points(scene, [part.kernel is not None for part in self.parts])
+
+    def translucent_points(self, scene: SceneMesh) -> NDArray[np.bool_]:
+        """(p,) which points of targets show baked subsurface light."""
+        return self._points(scene, [part.translucent for part in self.parts])
+
+    @staticmethod
+    def _points(scene: SceneMesh, of_material: list[bool]) -> NDArray[np.bool_]:
+        targets = np.zeros(len(scene.points), bool)
+        for target in scene.objects:
+            if target.is_target:
+                targets[target.points] = True
+        return targets & ~scene.loose & np.array(of_material)[scene.material]
+
+    def functions_of_object(self, scene: SceneMesh, target: SceneObject) -> Indices:
+        """The hemispherical functions of an object's rows; none where it is diffuse only."""
+        used = [self.parts[number] for number in np.unique(scene.material[target.points])]
+        if any(part.kernel is not None for part in used):
+            return self.functions
+        return functions_of(1) if any(part.translucent for part in used) else np.zeros(0, np.int64)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether some highlight or subsurface light differs between channels."""
+        return any((part.kernel is not None and part.kernel.shape[2] == 3) or part.translucent for part in self.parts)
+
+    def diffuse_albedo(self, scene: SceneMesh) -> NDArray[np.float32]:
+        """(p, 3) the diffuse part of what surfaces with rows of their own send back; for others the whole."""
+        whole = self.bounce_albedo(scene)
+        has_rows = np.array([part.kernel is not None for part in self.parts])
+        share = np.array([part.diffuse_share for part in self.parts], np.float32)
+        rows = self.glossy_points(scene) & has_rows[scene.material]
+        return np.where(rows[:, None], scene.albedo * share[scene.material, None], whole)
+
+    def bounce_albedo(self, scene: SceneMesh) -> NDArray[np.float32]:
+        """(p, 3) what surfaces send back of the light: the diffuse part and, spread evenly, the highlight."""
+        if all(part.material.is_diffuse for part in self.parts):
+            return scene.albedo
+        share = np.array([part.diffuse_share if part.kernel is not None else 1.0 for part in self.parts], np.float32)
+        # Where a highlight is not baked its light stays in the diffuse layer; a metal has none to put it in.
+        highlight = np.array([part.highlight * (1.0 if part.kernel is not None else part.material.metallic)
+                              for part in self.parts], np.float32)
+        return scene.albedo * share[scene.material, None] + highlight[scene.material]
+
+
+def plan_surfaces(scene: SceneMesh, settings: BakeSettings) -> SurfacePlan:
+    """What each material of the scene gets. Materials of casters that are not baked only need their bounced light."""
+    used = {int(number) for target in scene.objects if target.is_target
+            for number in np.unique(scene.material[target.points])}
+    left_out: list[LeftOut] = []
+    hints: list[str] = []
+    order = max(INCIDENT_ORDER, settings.order)
+    reflections: dict[int, Reflection] = {
+        number: reflection_of_material(material, order) for number, material in enumerate(scene.materials)
+        if material.specular_level > 0.0 or material.metallic > 0.0}
+    rows = {number: _rows(scene.materials[number], reflections[number], settings, left_out, hints)
+            for number in sorted(used & reflections.keys())}
+    functions = functions_of(max(rows.values())) if any(rows.values()) else np.zeros(0, np.int64)
+    parts = tuple(_part(material, reflections.get(number), functions if rows.get(number) else None, number in used,
+                        settings, left_out, hints) for number, material in enumerate(scene.materials))
+    return SurfacePlan(parts, functions, left_out, hints)
+
+
+def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSettings, left_out: list[LeftOut],
+          hints: list[str]) -> int:
+    """Rows that the highlight of a material gets; 0 leaves it to the diffuse layer."""
+    name = f"the highlight of material {material.name or 'without name'}"
+    albedo = float(reflection.albedo().max())
+    if settings.glossy_rows == 0:
+        left_out.append(LeftOut(name, "glossy_rows is 0", f"view-dependent rows; it returns {albedo:.1%} of the light"))
+        return 0
+    if albedo < settings.glossy_albedo:
+        left_out.append(LeftOut(name, f"it returns {albedo:.1%} of the light, less than glossy_albedo",
+                                "view-dependent rows"))
+        return 0
+    choice = choose_rows(material, settings.order, settings.glossy_rows, reflection)
+    if choice.kind == "glossy":
+        hints.append(f"{name}: {choice.why}")
+        return choice.rows
+    left_out.append(LeftOut(name if choice.kind == "diffuse" else f"sharp reflections of material {material.name}",
+                            choice.why, "view-dependent rows"))
+    # A metal has no diffuse layer that could stand in: a blurred reflection is nearer the truth than black.
+    return settings.glossy_rows if choice.kind == "mirror" and material.metallic > 0.5 else 0
+
+
+def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: Indices | None, is_used: bool,
+          settings: BakeSettings, left_out: list[LeftOut], hints: list[str]) -> SurfacePart:
+    """One material's part. functions: None where its highlight gets no rows."""
+    highlight = np.zeros(3) if reflection is None else np.broadcast_to(reflection.albedo(), 3)
+    translucent = material.is_translucent and settings.subsurface and is_used
+    if material.is_translucent and is_used and not settings.subsurface:
+        left_out.append(LeftOut(f"subsurface light of material {material.name}", "subsurface is false",
+                                "the subsurface stage and three channels"))
+    through = 1.0 - material.subsurface_weight if translucent else 1.0
+    if functions is None:
+        return SurfacePart(material, None, np.ones(1), through, np.zeros(1), highlight, translucent)
+    kernel = reflection_matrix(reflection, functions, np.arange(INCIDENT_ORDER ** 2), SMALLEST_INCIDENT)
+    if kernel.shape[2] == 3 and np.ptp(kernel, axis=2).max() <= _GREY * np.abs(kernel).max():
+        kernel = kernel[:, :, :1]
+    left = diffuse_left(material, functions)
+    bands = ringing_window(reflection, settings.order) if settings.glossy_window else np.ones(settings.order)
+    if bands[-1] < 1.0:
+        hints.append(f"the highlight of material {material.name}: light of order {settings.order} would ring in it; a"
+                     f" window leaves {bands[-1]:.0%} of the highest band (glossy_window=false keeps all)")
+    window = expand_bands(bands)
+    return SurfacePart(material, kernel, window, left.mean * through, left.coefficients * through, highlight,
+                       translucent)
+
+
+def row_metric(functions: Indices, albedo: NDArray[np.float32]) -> NDArray[np.float64] | None:
+    """The metric (rows, rows) in which an object's rows are compressed: radiance squared over the hemisphere of views.
+
+    The diffuse row is drawn times the albedo (p, 3), the others as they are. None for diffuse rows alone.
+    """
+    if not len(functions):
+        return None
+    metric = np.zeros((len(functions) + 1, len(functions) + 1))
+    metric[0, 0] = 2.0 * np.pi * max(float(np.mean(np.square(albedo, dtype=np.float64))), DARKEST)
+    metric[1:, 1:] = gram_matrix(functions)
+    return metric

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The subsurface stage: each translucent material of each object is a body of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..transport.dipole import Medium
+from ..transport.subsurface import Subsurface, subsurface_transfer
+from .surfaces import SurfacePlan
+
+
+@dataclass(frozen=True)
+class BodyLight:
+    """target: the object's name; points: (k,) places among its points; material: its name; light: of the medium, for
+    a subsurface weight of 1; transfer: (k, columns, 3) float32 exit radiance, weight included."""
+
+    target: str
+    points: NDArray[np.int64]
+    material: str
+    light: Subsurface
+    transfer: NDArray[np.float32]
+
+
+def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: NDArray[np.bool_],
+                         transfer: NDArray[np.float32], threads: int, seed: int,
+                         ) -> Generator[float, None, list[BodyLight]]:
+    """Yield progress, return the light of every body.
+
+    translucent: (p,) points that show it; transfer: (p, columns, channels) unit-albedo irradiance transfer.
+    """
+    bodies = [(target, number) for target in scene.objects if target.is_target
+              for number in np.unique(scene.material[target.points][translucent[target.points]])]
+    result = []
+    for index, (target, number) in enumerate(bodies):
+        start = target.points.start
+        points = np.flatnonzero(translucent[target.points] & (scene.material[target.points] == number))
+        material = surfaces.parts[number].material
+        medium = Medium.of_principled(material.base_colour, material.subsurface_radius)
+        steps = subsurface_transfer(scene.points[start + points], scene.normals[start + points],
+                                    point_areas(scene, target)[points], transfer[start + points], medium,
+                                    threads=threads, seed=seed)
+        try:
+            while True:
+                yield (index + next(steps)) / len(bodies)
+        except StopIteration as end:
+            light = end.value
+        weight = np.float32(material.subsurface_weight)
+        result.append(BodyLight(target.name, points, material.name, light, light.transfer * weight))
+    return result
+
+
+def point_areas(scene: SceneMesh, target: SceneObject) -> NDArray[np.float64]:
+    """Area (n,) in square metres that each point of an object stands for: a third of its triangles'."""
+    triangles = scene.triangles[target.triangles]
+    corners = scene.points[triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.sqrt(np.sum(across ** 2, axis=1))
+    count = target.points.stop - target.points.start
+    return np.bincount(triangles.ravel() - target.points.start, np.repeat(area / 3.0, 3), minlength=count)

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Materials beyond their albedo: every input that is read, what stands in for textures, tangents against Cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+
+from prt_addon.blender.cycles_bake import evaluate_corners, scratch_scene
+from prt_addon.blender.read_scene import read_objects
+from prt_addon.blender.surfaces import SurfaceReader
+from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.scene.surface_material import DIFFUSE, SurfaceMaterial
+from tests.blender.scenes import add_cube, add_material, depsgraph, place, unit
+
+Build = Callable[[bpy.types.NodeTree, bpy.types.Node], None]
+PRINCIPLED = SurfaceMaterial("M", (0.8, 0.8, 0.8), 0.5, 0.0, 1.5, 0.5)
+
+
+def one_node(kind: str, values: dict[str, object] | None = None, **properties: object) -> Build:
+    def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        node = tree.nodes.new(kind)
+        for name, value in properties.items():
+            setattr(node, name, value)
+        for name, value in (values or {}).items():
+            node.inputs[name].default_value = value
+        tree.links.new(node.outputs[0], output.inputs["Surface"])
+    return build
+
+
+def read(build: Build, warnings: list[str] | None = None) -> SurfaceMaterial:
+    return SurfaceReader([] if warnings is None else warnings).of(add_material("M", build)).material
+
+
+def assert_equal(found: SurfaceMaterial, expected: SurfaceMaterial) -> None:
+    for name, value in expected.__dict__.items():
+        assert getattr(found, name) == (value if isinstance(value, str) else pytest.approx(value, abs=1e-6)), name
+
+
+@pytest.mark.parametrize(("values", "changes"), [
+    ({}, {}),
+    ({"Base Color": (0.1, 0.2, 0.3, 1)}, {"base_colour": (0.1, 0.2, 0.3)}),
+    ({"Roughness": 0.3}, {"roughness": 0.3}),
+    ({"Metallic": 0.7}, {"metallic": 0.7}),
+    ({"IOR": 1.8}, {"ior": 1.8}),
+    ({"IOR": 0.5}, {"ior": 2.0}),
+    ({"Specular IOR Level": 0.9}, {"specular_level": 0.9}),
+    ({"Specular Tint": (1, 0.5, 0.25, 1)}, {"specular_tint": (1.0, 0.5, 0.25)}),
+    ({"Anisotropic": 0.6, "Anisotropic Rotation": 1.25}, {"anisotropic": 0.6, "anisotropic_rotation": 0.25}),
+    ({"Anisotropic Rotation": 0.25}, {}),
+    ({"Subsurface Weight": 0.4, "Subsurface Radius": (1, 0.5, 0.1), "Subsurface Scale": 0.02, "IOR": 1.3,
+      "Subsurface Anisotropy": 0.3},
+     {"subsurface_weight": 0.4, "subsurface_radius": (0.02, 0.01, 0.002), "subsurface_ior": 1.3, "ior": 1.3,
+      "subsurface_anisotropy": 0.3}),
+    ({"Metallic": 1.0, "Specular IOR Level": 0.0}, {"metallic": 1.0, "specular_level": 0.0}),
+])
+def test_every_principled_input(scene: bpy.types.Scene, values: dict[str, object], changes: dict[str, object]) -> None:
+    warnings: list[str] = []
+    assert_equal(read(one_node("ShaderNodeBsdfPrincipled", values), warnings), replace(PRINCIPLED, **changes))
+    assert not warnings
+
+
+def test_skin_has_its_own_ior(scene: bpy.types.Scene) -> None:
+    values = {"Subsurface Weight": 1.0, "Subsurface IOR": 1.6}
+    build = one_node("ShaderNodeBsdfPrincipled", values, subsurface_method="RANDOM_WALK_SKIN")
+    assert read(build).subsurface_ior == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize("build", [
+    one_node("ShaderNodeBsdfDiffuse"),
+    one_node("ShaderNodeEmission"),
+    one_node("ShaderNodeBsdfPrincipled", {"Specular IOR Level": 0.0}),
+    one_node("ShaderNodeBsdfPrincipled", {"IOR": 1.0}),
+    lambda tree, output: None,
+])
+def test_what_is_only_diffuse(scene: bpy.types.Scene, build: Build) -> None:
+    assert read(build) == DIFFUSE
+
+
+def widths(material: SurfaceMaterial) -> tuple[float, float]:
+    """Width of the highlight along and across the tangent, a quarter turn of the frame applied."""
+    aspect = (1.0 - 0.9 * material.anisotropic) ** 0.5
+    pair = material.roughness ** 2 / aspect, material.roughness ** 2 * aspect
+    return pair[::-1] if material.anisotropic_rotation == pytest.approx(0.25) else pair
+
+
+@pytest.mark.parametrize(("anisotropy", "along"), [(0.0, 1.0), (0.4, 0.6), (-0.4, 1.0 / 0.6)])
+def test_glossy_is_a_metal_that_reflects_its_colour(scene: bpy.types.Scene, anisotropy: float, along: float) -> None:
+    values = {"Color": (0.8, 0.4, 0.0, 1.0), "Roughness": 0.6, "Anisotropy": anisotropy}
+    found = read(one_node("ShaderNodeBsdfAnisotropic", values))
+    assert (found.metallic, found.roughness, found.specular_level) == (1.0, pytest.approx(0.6), 0.0)
+    colour = np.array(found.base_colour)
+    assert np.allclose(colour, (0.8, 0.4, 0.0))
+    # At 82 degrees (cosine 1/7) a metal reflects Schlick's value times its edge tint.
+    at_edge = (colour + (1.0 - colour) * (1.0 - 1.0 / 7.0) ** 5) * found.specular_tint
+    assert np.allclose(at_edge, colour)
+    assert widths(found) == pytest.approx((0.36 * along, 0.36 / along))
+
+
+def test_extreme_glossy_anisotropy_is_limited_and_named(scene: bpy.types.Scene) -> None:
+    warnings: list[str] = []
+    assert read(one_node("ShaderNodeBsdfAnisotropic", {"Anisotropy": 0.95}), warnings).anisotropic == 1.0
+    assert "anisotropy 0.95" in warnings[0]
+
+
+def linked(kind: str, output: str, name: str, setup: Callable[[bpy.types.Node], None] = lambda node: None) -> Build:
+    """A Principled BSDF with one input fed by a node."""
+    def build(tree: bpy.types.NodeTree, result: bpy.types.Node) -> None:
+        node, source = tree.nodes.new("ShaderNodeBsdfPrincipled"), tree.nodes.new(kind)
+        setup(source)
+        tree.links.new(source.outputs[output], node.inputs[name])
+        tree.links.new(node.outputs[0], result.inputs["Surface"])
+    return build
+
+
+def test_constants_are_read_through_links(scene: bpy.types.Scene) -> None:
+    warnings: list[str] = []
+    build = linked("ShaderNodeValue", "Value", "Roughness", lambda n: setattr(n.outputs[0], "default_value", 0.21))
+    assert read(build, warnings).roughness == pytest.approx(0.21)
+    assert not warnings
+
+
+def test_textures_have_a_stand_in_and_a_warning(scene: bpy.types.Scene) -> None:
+    image = bpy.data.images.new("half", 2, 1)
+    image.pixels.foreach_set(np.array([1, 0, 0.5, 1, 0, 0, 0.5, 1], np.float32))  # sRGB values
+    warnings: list[str] = []
+    build = linked("ShaderNodeTexImage", "Color", "Base Color", lambda n: setattr(n, "image", image))
+    assert read(build, warnings).base_colour == pytest.approx((0.5, 0.0, 0.2140), abs=2e-3)  # 8 bits
+    assert warnings == ["Material M: Base Color varies; the mean of image half stands in"]
+    image = bpy.data.images.new("data", 2, 1, is_data=True)
+    image.pixels.foreach_set(np.array([1, 0, 0.5, 1, 0, 0, 0.5, 1], np.float32))
+    build = linked("ShaderNodeTexImage", "Color", "Roughness", lambda n: setattr(n, "image", image))
+    assert read(build, []).roughness == pytest.approx(0.2126 * 0.5 + 0.0722 * 0.5, abs=2e-3)
+    warnings.clear()
+    assert read(linked("ShaderNodeTexNoise", "Fac", "Roughness"), warnings).roughness == pytest.approx(0.5)
+    assert warnings and "Material M" in warnings[0] and "Roughness" in warnings[0]
+
+
+def test_a_mixed_shader_is_diffuse_and_says_so(scene: bpy.types.Scene) -> None:
+    def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        mix = tree.nodes.new("ShaderNodeMixShader")
+        for index, kind in enumerate(("ShaderNodeBsdfDiffuse", "ShaderNodeBsdfAnisotropic")):
+            tree.links.new(tree.nodes.new(kind).outputs[0], mix.inputs[1 + index])
+        tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    warnings: list[str] = []
+    assert read(build, warnings) == DIFFUSE
+    assert "only its diffuse part" in warnings[0]
+
+
+def test_slots_materials_and_instances_reach_the_receivers(scene: bpy.types.Scene) -> None:
+    cube = add_cube()
+    for name, values in (("Matt", {"Specular IOR Level": 0.0}), ("Gold", {"Metallic": 1.0}), ("Wax", {
+            "Subsurface Weight": 1.0})):
+        cube.data.materials.append(add_material(name, one_node("ShaderNodeBsdfPrincipled", values)))
+    cube.data.polygons.foreach_set("material_index", np.array([0, 1, 2, 0, 1, 7], np.int32))
+    mesh, = read_objects(depsgraph())
+    assert [m.name for m in mesh.materials] == ["", "Gold", "Wax"]
+    assert sorted(np.bincount(mesh.material_index)) == [4, 4, 4]
+    assert mesh.corner_tangents is None
+    assembled = SceneMesh.assemble([mesh])
+    assert np.array_equal(np.bincount(assembled.material), [8, 8, 8])
+
+
+def add_test_mesh() -> bpy.types.Object:
+    """A smooth sphere, dented and with a texture map of unequal scales, its triangles those of Cycles."""
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=24, ring_count=16)
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.quads_convert_to_tris()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    bpy.ops.object.shade_smooth()
+    sphere = bpy.context.object
+    for vertex in sphere.data.vertices:
+        vertex.co.x *= 1.0 + 0.3 * vertex.co.z
+    sphere.data.update()
+    return sphere
+
+
+def cycles_tangents(scene_object: bpy.types.Object, build: Build) -> np.ndarray:
+    """The tangents (corners, 3) that a node tree emits as colours, evaluated by Cycles."""
+    def emitting(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        build(tree, output)
+        source = tree.nodes[-1]
+        scaled, emission = tree.nodes.new("ShaderNodeVectorMath"), tree.nodes.new("ShaderNodeEmission")
+        scaled.operation = "MULTIPLY_ADD"
+        scaled.inputs[1].default_value = scaled.inputs[2].default_value = (0.5, 0.5, 0.5)
+        tree.links.new(source.outputs["Tangent"], scaled.inputs[0])
+        tree.links.new(scaled.outputs[0], emission.inputs["Color"])
+        tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    mesh = scene_object.data.copy()
+    mesh.materials.clear()
+    mesh.materials.append(add_material("Emits", emitting))
+    with scratch_scene(bpy.context.scene) as scratch:
+        return evaluate_corners(scratch, mesh, np.array(scene_object.matrix_world), "EMIT") * 2.0 - 1.0
+
+
+def tangent_node(**properties: str) -> Build:
+    def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        for name, value in properties.items():
+            setattr(tree.nodes.new("ShaderNodeTangent") if name == "direction_type" else tree.nodes[-1], name, value)
+    return build
+
+
+def default_tangent(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+    tree.nodes.new("ShaderNodeNewGeometry")  # Cycles links this to an unlinked Tangent
+
+
+TRANSFORMS = {"none": Matrix.Identity(4), "scaled": Matrix.Rotation(0.7, 4, "Y") @ Matrix.Diagonal((1, 3, 0.5, 1)),
+              "mirrored": Matrix.Rotation(0.4, 4, "X") @ Matrix.Diagonal((-1, 2, 1, 1))}
+TANGENTS = {"default": (None, default_tangent), "X": ({"direction_type": "RADIAL", "axis": "X"}, None),
+            "Y": ({"direction_type": "RADIAL", "axis": "Y"}, None),
+            "UV": ({"direction_type": "UV_MAP", "uv_map": "UVMap"}, None)}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.parametrize("kind", TANGENTS)
+def test_tangents_are_those_of_cycles(scene: bpy.types.Scene, kind: str, transform: str) -> None:
+    sphere = add_test_mesh()
+    properties, build = TANGENTS[kind]
+
+    def anisotropic(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        one_node("ShaderNodeBsdfPrincipled", {"Anisotropic": 0.8})(tree, output)
+        if properties is not None:
+            tangent_node(**properties)(tree, output)
+            tree.links.new(tree.nodes[-1].outputs[0], tree.nodes["Principled BSDF"].inputs["Tangent"])
+    sphere.data.materials.append(add_material("Brushed", anisotropic))
+    place(sphere, TRANSFORMS[transform])
+    mesh, = read_objects(depsgraph())
+    assembled = SceneMesh.assemble([mesh])
+    expected = cycles_tangents(sphere, build or tangent_node(**properties))
+    corners = np.empty((len(sphere.data.loop_triangles), 3), np.int32)
+    sphere.data.loop_triangles.foreach_get("loops", corners.ravel())
+    if mesh.winding_flipped:
+        corners = corners[:, [0, 2, 1]]
+    expected = expected[corners].reshape(-1, 3)
+    found = assembled.tangents[assembled.triangles].reshape(-1, 3)
+    local = np.array(sphere.matrix_world.inverted())
+    places = assembled.points[assembled.triangles].reshape(-1, 3) @ local[:3, :3].T + local[:3, 3]
+    # Next to the axis every direction is as good as another, and Cycles evaluates a little inside the triangle. At the
+    # seam of the map it keeps a tangent on each side, where a receiver takes their mean: 16 of 1,645 corners.
+    axis = {"X": 0, "Y": 1}.get(kind, 2)
+    away = np.abs(unit(places)[:, axis]) < 0.9
+    angle = np.degrees(np.arccos(np.clip(np.sum(unit(found) * unit(expected), axis=1)[away], -1, 1)))
+    assert away.mean() > 0.6
+    assert np.percentile(angle, 94 if kind == "UV" else 100) < 0.2
+    assert np.abs(np.sum(assembled.tangents * assembled.normals, axis=1)).max() < 1e-9
+
+
+def test_generated_coordinates_come_from_before_deformation(scene: bpy.types.Scene) -> None:
+    """A cast into a far place moves vertices, not the axis around which they were brushed."""
+    sphere = add_test_mesh()
+    sphere.data.materials.append(add_material("Brushed", one_node("ShaderNodeBsdfPrincipled", {"Anisotropic": 0.8})))
+    before = SceneMesh.assemble(read_objects(depsgraph()))
+    modifier = sphere.modifiers.new("Away", "DISPLACE")
+    modifier.direction, modifier.strength, modifier.mid_level = "X", 7.0, 0.0
+    after = SceneMesh.assemble(read_objects(depsgraph()))
+    assert np.allclose(after.points, before.points + np.array([7.0, 0, 0]), atol=1e-4)
+    assert np.allclose(after.tangents, before.tangents, atol=1e-4)
+
+
+def render_of_cycles(build: Build, folder: Path) -> np.ndarray:
+    """A sphere of this material under two Suns, direct light only: (32, 32, 3)."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=32, ring_count=24)
+    bpy.ops.object.shade_smooth()
+    bpy.context.object.data.materials.append(add_material("M", build))
+    for turn, energy in (((0.6, 0.2, 0.0), 3.0), ((1.2, 0.0, 1.0), 2.0)):
+        sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+        sun.data.energy, sun.rotation_euler = energy, turn
+        scene.collection.objects.link(sun)
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 2.2
+    scene.camera.location, scene.camera.rotation_euler = (0.0, -4.0, 4.0), (np.pi / 4, 0.0, 0.0)
+    scene.collection.objects.link(scene.camera)
+    scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 16, 0
+    scene.cycles.use_denoising = False
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(folder / "render.exr")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    return np.array(image.pixels[:]).reshape(32, 32, 4)[..., :3]
+
+
+@pytest.mark.parametrize("anisotropy", [0.4, -0.4])
+def test_glossy_read_as_principled_renders_the_same_in_cycles(tmp_path: Path, anisotropy: float) -> None:
+    values = {"Color": (0.8, 0.4, 0.1, 1), "Roughness": 0.5, "Anisotropy": anisotropy, "Rotation": 0.1}
+    build = one_node("ShaderNodeBsdfAnisotropic", values, distribution="GGX")
+    original, found = render_of_cycles(build, tmp_path), read(build)
+
+    def principled(turn: float) -> Build:
+        return one_node("ShaderNodeBsdfPrincipled", {
+            "Base Color": (*found.base_colour, 1), "Roughness": found.roughness, "Metallic": found.metallic,
+            "Specular Tint": (*found.specular_tint, 1), "Anisotropic": found.anisotropic,
+            "Anisotropic Rotation": found.anisotropic_rotation + turn}, distribution="GGX")
+
+    def difference(turn: float) -> float:
+        rendered = render_of_cycles(principled(turn), tmp_path)
+        return float(np.sqrt(((rendered - original) ** 2).mean() / (original ** 2).mean()))
+    assert difference(0.0) < 1e-3
+    assert difference(0.25) > 0.3
