@@ -21,7 +21,7 @@ from . import unlocked_blas
 Array = NDArray[np.floating]
 
 _SINGLE = np.dtype(np.float32)
-# Multiplications in a product from which on giving up Python's lock, for other threads to run, gains more than it costs.
+# Multiplications from which on giving up the lock of Python, for other threads to run, gains more than it costs.
 UNLOCKED_WORK = 250_000
 
 
