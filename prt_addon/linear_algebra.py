@@ -16,9 +16,13 @@ from scipy import linalg
 from scipy.linalg import blas, lapack
 from scipy.sparse import csr_array
 
+from . import unlocked_blas
+
 Array = NDArray[np.floating]
 
 _SINGLE = np.dtype(np.float32)
+# Multiplications from which on giving up the lock of Python, for other threads to run, gains more than it costs.
+UNLOCKED_WORK = 250_000
 
 
 def _same_type(*arrays: Array) -> np.dtype:
@@ -36,6 +40,12 @@ def _operand(matrix: Array) -> tuple[Array, int]:
     return np.ascontiguousarray(matrix).T, 0
 
 
+def _contiguous(matrix: Array) -> Array:
+    """The matrix itself where it is contiguous in either order, else a copy that is."""
+    flags = matrix.flags
+    return matrix if flags.c_contiguous or flags.f_contiguous else np.ascontiguousarray(matrix)
+
+
 def multiply(a: Array, b: Array, out: Array | None = None, accumulate: bool = False) -> Array:
     """The product a (m, k) times b (k, n) as a C-ordered (m, n) array.
 
@@ -44,6 +54,10 @@ def multiply(a: Array, b: Array, out: Array | None = None, accumulate: bool = Fa
     if a.dtype == _SINGLE and b.dtype == _SINGLE and out is None and a.ndim == b.ndim == 2 and a.size and b.size \
             and a.shape[1] == b.shape[0]:
         # The same as below for the many small products of the encoders, where the checks would cost as much again.
+        if unlocked_blas.available and a.shape[0] * b.size > UNLOCKED_WORK:
+            result = np.empty((a.shape[0], b.shape[1]), _SINGLE)
+            unlocked_blas.gemm(_contiguous(a), _contiguous(b), result)
+            return result
         right, right_flag = _operand(b)
         left, left_flag = _operand(a)
         return blas.sgemm(1.0, right, left, trans_a=right_flag, trans_b=left_flag).T
@@ -55,13 +69,17 @@ def multiply(a: Array, b: Array, out: Array | None = None, accumulate: bool = Fa
         if out is not None and not accumulate:
             out[...] = 0
         return result
+    if out is not None and (out.dtype != kind or not out.flags.c_contiguous or out.shape != (a.shape[0], b.shape[1])):
+        raise ValueError("multiply: out must be a C-ordered array of the product's shape and type")
+    if unlocked_blas.available and a.shape[0] * b.size > UNLOCKED_WORK:
+        result = np.empty((a.shape[0], b.shape[1]), kind) if out is None else out
+        unlocked_blas.gemm(_contiguous(np.asarray(a, kind)), _contiguous(np.asarray(b, kind)), result, accumulate)
+        return result
     right, right_flag = _operand(np.asarray(b, kind))
     left, left_flag = _operand(np.asarray(a, kind))
     gemm = blas.sgemm if kind == np.float32 else blas.dgemm
     if out is None:
         return gemm(1.0, right, left, trans_a=right_flag, trans_b=left_flag).T
-    if out.dtype != kind or not out.flags.c_contiguous or out.shape != (a.shape[0], b.shape[1]):
-        raise ValueError("multiply: out must be a C-ordered array of the product's shape and type")
     gemm(1.0, right, left, beta=1.0 if accumulate else 0.0, c=out.T, overwrite_c=True,
          trans_a=right_flag, trans_b=left_flag)
     return out
@@ -121,6 +139,18 @@ def small_symmetric_eigenpairs(matrix: Array) -> tuple[Array, Array]:
     if status != 0:
         raise ValueError(f"small_symmetric_eigenpairs: LAPACK's dsyevd ended with {status}")
     return values[::-1], vectors[:, ::-1]
+
+
+def many_symmetric_eigenpairs(matrices: NDArray[np.float64]) -> tuple[Array, Array]:
+    """All eigenvalues, descending (k, n), and eigenvectors as rows (k, n, n) of small symmetric matrices (k, n, n), in
+    double precision, without Python's lock. Signs as LAPACK leaves them; raises ValueError where it does not converge.
+    """
+    if unlocked_blas.available:
+        vectors = np.array(matrices, np.float64, order="C")
+        values = unlocked_blas.eigenpairs_in_place(vectors)
+        return values[:, ::-1], vectors[:, ::-1]
+    pairs = [small_symmetric_eigenpairs(matrix) for matrix in matrices]
+    return np.stack([pair[0] for pair in pairs]), np.stack([pair[1].T for pair in pairs])
 
 
 def small_generalized_eigenpairs(a: Array, b: Array) -> tuple[Array, Array] | None:

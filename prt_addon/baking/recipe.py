@@ -404,6 +404,7 @@ class _Bake:
         target = settings.compression_error ** 2 if settings.compression_error > 0.0 else None
         clusters = most_clusters(settings, receivers, shape)
         return EncoderSettings(clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
+                               threads=settings.threads,
                                vectors_limit=24 if settings.encoder == "adaptive" else None)
 
     def _errors(self, transfer: NDArray[np.float32], encodings: dict[str, Encoding],

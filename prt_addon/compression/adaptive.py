@@ -72,7 +72,7 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
     data = frame.coordinates
     state.resize(data.shape[1], most + SPARE)
     for _ in range(SPECTRUM_STEPS):
-        best = update(data, state, monitor.tick), state.labels, state.vectors
+        best = update(data, state, monitor.workers), state.labels, state.vectors
     if not adaptation_pays(state.errors, state.counts, state.spread[:, :most], settings.vectors):
         monitor.note("adaptive left out", best[0], 1.0)
         return False
@@ -85,7 +85,7 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
             best = error, state.labels, state.vectors
         if error > last * (1 - settings.tolerance) or round_number == ROUNDS - 1:
             break
-        reclassify(data, state, monitor.tick)
-        update(data, state, monitor.tick)
+        reclassify(data, state, monitor.workers)
+        update(data, state, monitor.workers)
     state.labels, state.vectors = best[1], best[2]
     return True

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from .global_frame import GlobalFrame
 from .monitor import Monitor
-from .neighbours import Neighbours, Sweep, reclassify_near
+from .neighbours import Neighbours, Sweep, nearest_of_all, reclassify_near
 from .rebalancing import exchange, rebalance
 from .reclassify import reclassify
 from .seeding import split_seeds
 from .settings import EncoderSettings
-from .subspaces import SPARE, Subspaces, from_labels, update
+from .subspaces import SPARE, Single, Subspaces, from_labels, update
 from .vector_quantization import lbg, random_means
+from .workers import Workers
 
 # Energy that the values left out may hold, relative to the current squared error.
 TRUNCATION = 0.1
@@ -28,6 +29,13 @@ TRUNCATION = 0.1
 SEED_TRUNCATION = 0.3
 # Vectors with which the first splits are judged.
 SEED_VECTORS = 2
+# Points for each cluster from which the first splits are made.
+SEED_POINTS = 48
+# Points of which no part is taken.
+FEW_POINTS = 1 << 14
+# Points for each of the few clusters that tell whether a target is in reach, and the predicted error over the target
+# from which on it is not: vectors and sweeps lower the error of splits by a factor of two or three.
+REACH_POINTS, OUT_OF_REACH = 128, 8.0
 # Relative decrease of the squared error below which sweeps end while vectors are still to be added, and before the
 # exact ones, in multiples of the tolerance asked for: what these sweeps leave, later ones find.
 WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
@@ -55,13 +63,13 @@ class Work:
         """Update a state on `width` leading values; the error returned counts the energy left out as error, so it
         bounds the true one from above."""
         state.resize(width, state.bases.shape[1])
-        return update(self.frame.coordinates[:, :width], state, self.monitor.tick) + float(self.frame.tail[width])
+        return update(self.frame.coordinates[:, :width], state, self.monitor.workers) + float(self.frame.tail[width])
 
     def sweep(self, state: Subspaces, error: float) -> tuple[Sweep, float]:
         """One classification among neighbours and one update, on as many values as the error asks for."""
         width = state.means.shape[1]
         data, before = self.frame.coordinates[:, :width], state.labels
-        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.tick)
+        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers)
         self.neighbours.learn(before, state.labels, sweep.runner_up)
         return sweep, self.fit(state, max(width, self.frame.leading(TRUNCATION * error)))
 
@@ -70,33 +78,68 @@ def static_labels(frame: GlobalFrame, settings: EncoderSettings, monitor: Monito
     """Section 4.1: LBG from random points of the signal."""
     generator = np.random.default_rng(settings.seed)
     data = frame.coordinates
-    return lbg(data, random_means(data, settings.clusters, generator), settings.iterations, monitor.tick)
+    return lbg(data, random_means(data, settings.clusters, generator), settings.iterations, monitor.workers)
 
 
 def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, monitor: Monitor,
                 seed_vectors: int = SEED_VECTORS) -> Subspaces:
     """Subspaces from best-first splits.
 
-    With a target, splits are judged with all vectors and end where the target is met, so that a simple signal gets few
-    clusters; otherwise with seed_vectors.
+    With a target in reach, splits are judged with all vectors and end where the target is met, so that a simple signal
+    gets few clusters. Otherwise they are judged with seed_vectors on a random part of the points, as they are only a
+    start, and every point goes to the nearest subspace.
     """
-    if settings.target_error is not None:
+    if settings.target_error is not None and _in_reach(frame, settings, enough, monitor.workers):
         vectors, width = settings.vectors, frame.leading(TRUNCATION * enough)
         labels, _ = split_seeds(frame.coordinates, settings.clusters, vectors, enough - frame.tail[width],
-                                lambda _: width, monitor.tick)
-    else:
-        vectors = min(seed_vectors, settings.vectors)
-        labels, error = split_seeds(frame.coordinates, settings.clusters, vectors, enough,
-                                    lambda error: frame.leading(SEED_TRUNCATION * error), monitor.tick)
-        width = frame.leading(TRUNCATION * error)
-    return from_labels(labels, int(labels.max()) + 1, width, vectors)
+                                lambda _: width, monitor.workers)
+        return from_labels(labels, int(labels.max()) + 1, width, vectors)
+    vectors = min(seed_vectors, settings.vectors)
+    part, scale = _random_part(frame, settings, settings.clusters * SEED_POINTS)
+    labels, error = split_seeds(part, settings.clusters, vectors, enough / scale,
+                                lambda error: frame.leading(SEED_TRUNCATION * error * scale), monitor.workers)
+    width = frame.leading(TRUNCATION * error * scale)
+    state = from_labels(labels, int(labels.max()) + 1, width, vectors)
+    if len(part) < len(frame.coordinates):
+        update(part[:, :width], state, monitor.workers)
+        state.labels = nearest_of_all(frame.coordinates[:, :width], state, monitor.workers)
+    return state
+
+
+def _random_part(frame: GlobalFrame, settings: EncoderSettings, most: int) -> tuple[Single, float]:
+    """About `most` random points of the signal, in their order, and how many points each of them stands for; all where
+    that would be nearly all, or where there are so few that it saves nothing."""
+    points = len(frame.coordinates)
+    if most > 0.7 * points or points < FEW_POINTS:
+        return frame.coordinates, 1.0
+    chosen = np.random.default_rng(settings.seed).permutation(points)[:most]
+    return frame.coordinates[np.sort(chosen)], points / most
+
+
+def _in_reach(frame: GlobalFrame, settings: EncoderSettings, enough: float, workers: Workers) -> bool:
+    """Whether all clusters could meet the target, by splits of few points into few clusters.
+
+    Their squared error falls by about the same factor with each doubling of the clusters. Where the error that this
+    predicts is far above the target, no care needs to be spent on stopping in time.
+    """
+    few, more = settings.clusters // 32, settings.clusters // 8
+    part, scale = _random_part(frame, settings, more * REACH_POINTS)
+    if few < 2 or scale == 1.0:
+        return True
+    errors = [split_seeds(part, clusters, settings.vectors, enough / scale,
+                          lambda error: frame.leading(TRUNCATION * error * scale), workers)[1] * scale
+              for clusters in (few, more)]
+    if min(errors) <= enough:
+        return True
+    falls = np.log(errors[0] / errors[1]) / np.log(more / few)
+    return bool(errors[1] * (more / settings.clusters) ** falls < OUT_OF_REACH * enough)
 
 
 def random_start(frame: GlobalFrame, settings: EncoderSettings, number: int, monitor: Monitor) -> Subspaces:
     """The paper's own start: random points of the signal, LBG, no vectors yet."""
     generator = np.random.default_rng((settings.seed, number))
     means = random_means(frame.coordinates, settings.clusters, generator)
-    labels = lbg(frame.coordinates, means, settings.iterations, monitor.tick)
+    labels = lbg(frame.coordinates, means, settings.iterations, monitor.workers)
     return from_labels(labels, settings.clusters, frame.coordinates.shape[1], 0)
 
 
@@ -119,7 +162,7 @@ def rearrange(work: Work, state: Subspaces, error: float, sweep: Sweep, toleranc
     for _ in range(ROUNDS):
         before = state.copy()
         data = work.frame.coordinates[:, :state.means.shape[1]]
-        if rebalance(data, state, sweep, work.monitor.tick) == 0:
+        if rebalance(data, state, sweep, work.monitor.workers) == 0:
             break
         now, sweep = settle(work, state, work.fit(state, state.means.shape[1]), tolerance)
         if now >= error:
@@ -156,13 +199,13 @@ def polish(work: Work, state: Subspaces, enough: float) -> float:
 
     Clusters that lost all points restart in the worst approximated ones.
     """
-    data, tick = work.frame.coordinates, work.monitor.tick
-    last = work.fit(state, data.shape[1])
+    data, workers = work.frame.coordinates, work.monitor.workers
+    last, _ = settle(work, state, work.fit(state, data.shape[1]), EXACT * work.settings.tolerance)
     for _ in range(work.settings.iterations):
-        changed = reclassify(data, state, tick)
-        error = update(data, state, tick)
-        if error > enough and (state.counts == 0).any() and rebalance(data, state, None, tick):
-            error = update(data, state, tick)
+        changed = reclassify(data, state, workers)
+        error = update(data, state, workers)
+        if error > enough and (state.counts == 0).any() and rebalance(data, state, None, workers):
+            error = update(data, state, workers)
         if changed == 0 or error >= last * (1 - EXACT * work.settings.tolerance):
             break
         last = error

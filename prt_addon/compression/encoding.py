@@ -14,10 +14,11 @@ from ..linear_algebra import multiply
 from .adaptive import adapt, trim_vectors
 from .clustered_pca import SEED_VECTORS, disturb, iterate, random_start, split_start, static_labels
 from .global_frame import GlobalFrame, global_frame
-from .monitor import Monitor, Progress, Tick
+from .monitor import Monitor, Progress
 from .pca import principal_components
 from .settings import EncoderSettings
 from .subspaces import Subspaces
+from .workers import Workers
 
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
 ROUNDING = 1e-12
@@ -82,13 +83,14 @@ def encode(signal: NDArray[np.floating], settings: EncoderSettings, metric: NDAr
     and fewer clusters and vectors are used where more would not lower the error.
     """
     monitor = Monitor(progress)
-    left_out = UNSEEN * settings.target_error if settings.target_error else UNSEEN_WITHOUT_TARGET
-    frame = global_frame(signal, metric, monitor.tick, left_out)
-    monitor.unit = frame.scale**2
-    labels, vectors, left_out = _classify(frame, settings, monitor)
-    monitor.span(0.95, 1.0)
-    enough = _enough(frame, settings) if settings.target_error is not None else None
-    result = _finish(frame, labels, vectors, enough, monitor.tick)
+    unseen = UNSEEN * settings.target_error if settings.target_error else UNSEEN_WITHOUT_TARGET
+    with Workers(settings.threads, monitor.tick) as monitor.workers:
+        frame = global_frame(signal, metric, monitor.workers, unseen)
+        monitor.unit = frame.scale**2
+        labels, vectors, left_out = _classify(frame, settings, monitor)
+        monitor.span(0.95, 1.0)
+        enough = _enough(frame, settings) if settings.target_error is not None else None
+        result = _finish(frame, labels, vectors, enough, monitor.workers)
     monitor.note("done", float(result.discarded.sum()) / monitor.unit, 1.0)
     return replace(result, history=tuple(monitor.history), adaptive_left_out=left_out)
 
@@ -160,17 +162,15 @@ def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, mo
 
 
 def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64],
-            enough: float | None, tick: Tick) -> Encoding:
+            enough: float | None, workers: Workers) -> Encoding:
     """Exact PCA of every cluster on all values, then back to the signal's own values.
 
     enough: squared error up to which the least useful vectors are left out again; None keeps all.
     """
     used, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(counts)[:-1])
-    fits = []
-    for cluster, points in zip(used, members, strict=True):
-        tick()
-        fits.append(principal_components(frame.coordinates[points], int(vectors[cluster])))
+    fits = workers.run(lambda pair: principal_components(frame.coordinates[pair[1]], int(vectors[pair[0]])),
+                       list(zip(used, members, strict=True)))
     scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:
@@ -180,7 +180,7 @@ def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.i
     weights = np.zeros((len(labels), most), np.float32)
     discarded = np.zeros(len(fits))
     for cluster, (points, (mean, axes, _)) in enumerate(zip(members, fits, strict=True)):
-        tick()
+        workers.tick()
         axes = axes[:kept[cluster]]
         bases[cluster, 0], bases[cluster, 1:len(axes) + 1] = mean, axes
         for start in range(0, len(points), CHUNK):

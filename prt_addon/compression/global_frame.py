@@ -16,7 +16,7 @@ from scipy import linalg
 
 from ..errors import PRTError
 from ..linear_algebra import gram, multiply, small_batched_multiply, symmetric_eigenpairs
-from .monitor import Tick, no_tick
+from .workers import SERIAL, Workers
 
 # Rows per pass: bounds the temporaries. Constant, so that results never depend on the memory of a machine.
 CHUNK = 4096
@@ -83,7 +83,7 @@ def metric_roots(metric: NDArray | None, values: int) -> tuple[NDArray, NDArray]
             np.kron(multiply(vectors / roots, vectors.T), columns))
 
 
-def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, tick: Tick = no_tick,
+def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, workers: Workers = SERIAL,
                  left_out: float = 1e-8) -> GlobalFrame:
     """The principal axes of a signal (p, n) in a metric, and the signal in them.
 
@@ -93,9 +93,9 @@ def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, ti
     check_signal(signal)
     points, values = signal.shape
     if values > WIDE:
-        return leading_frame(signal, metric, left_out, tick)
+        return leading_frame(signal, metric, left_out, workers)
     root, inverse_root = metric_roots(metric, values)
-    mean, covariance, scale = _moments(signal, tick)
+    mean, covariance, scale = _moments(signal, workers)
     within = multiply(multiply(root, covariance / points), root)
     _, axes = symmetric_eigenpairs((within + within.T) / 2)
     forward = multiply(root, axes) / scale
@@ -104,7 +104,7 @@ def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, ti
     seen, sums = np.zeros(values), np.zeros(values)
     single = np.ascontiguousarray(forward * scale, np.float32)
     for start in range(0, points, CHUNK):
-        tick()
+        workers.tick()
         block = coordinates[start:start + CHUNK]
         multiply(_centred(signal[start:start + CHUNK], mean, scale), single, out=block)
         seen += np.square(block).sum(axis=0, dtype=np.float64)
@@ -123,13 +123,13 @@ def _centred(block: NDArray[np.floating], mean: NDArray[np.float64], scale: floa
     return np.ascontiguousarray(result, np.float32)
 
 
-def _moments(signal: NDArray[np.floating], tick: Tick) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _moments(signal: NDArray[np.floating], workers: Workers) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Mean (n,) rounded to single precision, scatter about it (n, n) over the scale's square, and the scale, the power
     of two nearest to the largest difference from the mean: sums of single-precision blocks in double precision."""
     mean, scale = _mean_and_scale(signal)
     scatter = np.zeros((signal.shape[1], signal.shape[1]))
     for start in range(0, len(signal), CHUNK):
-        tick()
+        workers.tick()
         scatter += gram(_centred(signal[start:start + CHUNK], mean, scale))
     return mean, scatter, scale
 
@@ -173,15 +173,15 @@ class _Wide:
         stacked = rows.reshape(len(rows), len(matrix), -1)
         return small_batched_multiply(matrix.astype(rows.dtype)[None], stacked).reshape(rows.shape)
 
-    def blocks(self, tick: Tick) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    def blocks(self, workers: Workers) -> Iterator[tuple[slice, NDArray[np.float32]]]:
         """Centred rows in the metric, in single precision."""
         for start in range(0, len(self.signal), CHUNK):
-            tick()
+            workers.tick()
             part = slice(start, start + CHUNK)
             yield part, self.within(_centred(self.signal[part], self.mean, self.scale), self.root)
 
 
-def leading_frame(signal: NDArray[np.floating], metric: NDArray | None, left_out: float, tick: Tick = no_tick,
+def leading_frame(signal: NDArray[np.floating], metric: NDArray | None, left_out: float, workers: Workers = SERIAL,
                   ) -> GlobalFrame:
     """As `global_frame` for signals so wide that all their axes cost more than the encode itself: only as many leading
     ones as leave out `left_out` of the energy, which tail[-1] holds and every error counts in.
@@ -197,12 +197,12 @@ def leading_frame(signal: NDArray[np.floating], metric: NDArray | None, left_out
         width = min(width, most)
         sample = np.zeros((values, width))
         directions = generator.standard_normal((values, width), np.float32)
-        for _, block in wide.blocks(tick):
+        for _, block in wide.blocks(workers):
             sample += multiply(block.T, multiply(block, directions))
         basis = np.ascontiguousarray(linalg.qr(sample, mode="economic")[0], np.float32)
         coordinates = np.empty((points, width), np.float32)
         rest, energy, offset = 0.0, 0.0, wide.within(wide.mean[None] / wide.scale, wide.root)
-        for part, block in wide.blocks(tick):
+        for part, block in wide.blocks(workers):
             coordinates[part] = multiply(block, basis)
             energy += float(np.sum(np.square(block + offset), dtype=np.float64))
             block -= multiply(coordinates[part], basis.T)

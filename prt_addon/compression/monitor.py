@@ -7,15 +7,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from .workers import INTERVAL, Workers
+
 Progress = Callable[[float], None]
-Tick = Callable[[], None]
-
-# Seconds between two calls of the progress function outside the ends of stages.
-INTERVAL = 0.1
-
-
-def no_tick() -> None:
-    """For callers that neither show progress nor cancel."""
 
 
 @dataclass
@@ -23,7 +17,7 @@ class Monitor:
     """Collects the history of an encode and passes the fraction done to a progress function, which may raise.
 
     unit: factor from the encoder's squared errors to the signal's. low, high: the range of the fraction that the
-    current part of the work covers.
+    current part of the work covers. workers: who does the steps' work.
     """
 
     progress: Progress | None = None
@@ -35,6 +29,7 @@ class Monitor:
     fraction: float = 0.0
     told: float = 0.0
     prefix: str = ""
+    workers: Workers = field(default_factory=Workers)
 
     def span(self, low: float, high: float, prefix: str = "") -> None:
         """The next part of the work covers this range of the whole; its stages are named with the prefix."""

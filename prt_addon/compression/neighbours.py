@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
-from .monitor import Tick, no_tick
 from .subspaces import Single, Subspaces, by_cluster
+from .workers import SERIAL, Workers
 
 # Subspaces of the nearest means among which a point is classified, its own included, and others that take turns.
 NEAREST, OTHERS, STRIDE = 12, 6, 6
 MEMORY = 0.5
-# Clusters whose neighbours' vectors are gathered together.
-BLOCK = 16
+# Clusters at most that share their lists, points classified in one product, groups that a thread takes at a time.
+# Not a power of two: columns that far apart would share the same few lines of the cache.
+GROUP, ROWS, TOGETHER = 4, 1000, 4
 
 
 class Sweep(NamedTuple):
@@ -64,63 +65,103 @@ class Neighbours:
                 clusters, clusters)
 
 
-def reclassify_near(data: Single, state: Subspaces, lists: NDArray[np.intp], tick: Tick = no_tick) -> Sweep:
-    """Give every point of data (p, d) to the nearest of the subspaces on its cluster's list, in place."""
+def reclassify_near(data: Single, state: Subspaces, lists: NDArray[np.intp], workers: Workers = SERIAL) -> Sweep:
+    """Give every point of data (p, d) to the nearest of the subspaces on its cluster's list, in place.
+
+    Clusters whose means are near share the subspaces on all their lists: a few large products instead of many small
+    ones are faster, in threads above all, and more subspaces are tried.
+    """
     order, ends = by_cluster(state.labels, len(state.means))
     rows = state.vector_major()
-    near = lists.shape[1]
-    best, second = np.empty(len(order), np.intp), np.empty(len(order), np.intp)
+    labels, runner_up = state.labels.copy(), state.labels.copy()
     rise = np.zeros(len(order), np.float32)
-    columns = np.arange(int(state.counts.max()))
-    for first in range(0, len(lists), BLOCK):
-        block = slice(first, first + BLOCK)
-        planes, offsets, lengths = _planes(state.means, rows, lists[block], first)
-        for index in range(len(planes)):
-            start, end = ends[first + index:first + index + 2]
-            if start == end:
-                continue
-            tick()
-            squared = _squared(data[order[start:end]] - state.means[first + index], planes[index], offsets[index],
-                               lengths[index])
-            least = best[start:end] = squared.argmin(axis=0)
-            here = columns[:end - start]
-            rise[start:end] = squared[least, here]
-            if near > 1:
-                squared[least, here] = np.inf
-                least = second[start:end] = squared.argmin(axis=0)
-                rise[start:end] = squared[least, here] - rise[start:end]
-    own = np.repeat(np.arange(len(lists)), np.diff(ends))
-    labels, runner_up = np.empty_like(state.labels), np.empty_like(state.labels)
-    labels[order] = lists[own, best]
-    runner_up[order] = lists[own, second if near > 1 else best]
-    cost = np.bincount(labels[order], rise, len(lists))
+
+    def classify(groups: list[NDArray[np.intp]]) -> None:
+        for group in groups:
+            points = np.concatenate([order[ends[cluster]:ends[cluster + 1]] for cluster in group])
+            tried = np.unique(lists[group])
+            for start in range(0, len(points), ROWS):
+                part = points[start:start + ROWS]
+                best, second, rise[part] = _two_nearest(data[part], state.means[tried], rows[:, tried])
+                labels[part], runner_up[part] = tried[best], tried[second]
+
+    groups = _neighbouring(state.means, np.flatnonzero(state.counts))
+    workers.run(classify, [groups[first:first + TOGETHER] for first in range(0, len(groups), TOGETHER)])
+    cost = np.bincount(labels, rise, len(lists))
     changed = int((labels != state.labels).sum())
     state.labels = labels
     return Sweep(changed, runner_up, cost)
 
 
-def _planes(means: Single, rows: Single, lists: NDArray[np.intp], first: int) -> tuple[Single, Single, Single]:
-    """For a block of clusters from `first`, of the subspaces j on their lists (b, J): per cluster the rows of all
-    vectors of the j and at last mean_j - mean ((q + 1) J, d); the vectors' products with that (q J, 1); its squared
-    length (J, 1)."""
-    block, _near = lists.shape
-    shift = means[lists] - means[first:first + block, None]
-    planes = np.concatenate([rows[:, lists], shift[None]]).transpose(1, 0, 2, 3)
-    planes = np.ascontiguousarray(planes)
-    offsets = (planes[:, :-1] * shift[:, None]).sum(axis=-1)
-    return planes.reshape(block, -1, means.shape[1]), offsets.reshape(block, -1, 1), row_squares(shift)[:, :, None]
+def nearest_of_all(data: Single, state: Subspaces, workers: Workers = SERIAL) -> NDArray[np.int32]:
+    """The nearest of all subspaces with points to every point of data (p, d), up to rounding against the size of the
+    whole signal: (p,)."""
+    filled = np.flatnonzero(state.counts)
+    means, rows = state.means[filled], state.vector_major()[:, filled]
+    labels = np.empty(len(data), np.int32)
+
+    def classify(start: int) -> None:
+        part = slice(start, start + ROWS)
+        labels[part] = filled[_two_nearest(data[part], means, rows)[0]]
+
+    workers.run(classify, range(0, len(data), ROWS))
+    return labels
 
 
-def _squared(centred: Single, planes: Single, offsets: Single, lengths: Single) -> Single:
-    """Squared distances (J, m), less the points' own squared lengths, of points centred (m, d) to subspaces that
-    `_planes` prepared."""
-    near = len(lengths)
-    products = multiply(planes, centred.T)
-    squared = products[len(offsets):] * np.float32(-2)
-    squared += lengths
-    if len(offsets):
-        inside = products[:len(offsets)]
-        inside -= offsets
+def _neighbouring(means: Single, clusters: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Clusters in groups of at most GROUP whose means are near: halved again and again at the median of the value
+    that varies most."""
+    if len(clusters) <= GROUP:
+        return [clusters] if len(clusters) else []
+    own = means[clusters]
+    order = np.argsort(own[:, np.argmax(own.max(axis=0) - own.min(axis=0))], kind="stable")
+    half = len(clusters) // 2
+    return _neighbouring(means, clusters[order[:half]]) + _neighbouring(means, clusters[order[half:]])
+
+
+def _two_nearest(points: Single, means: Single, rows: Single) -> tuple[NDArray[np.intp], NDArray[np.intp], Single]:
+    """For points (m, d) the nearest and second nearest (m,) of the subspaces with means (J, d) and vectors rows
+    (q, J, d), and the difference of their squared distances.
+
+    Differences are taken from the means' centre, so that rounding stays small against the clusters' own size. The
+    products with the centre come out of the same product as those with the points, from a last value that is 1.
+    """
+    most, count, values = rows.shape
+    centre = means.mean(axis=0)
+    shift = means - centre
+    planes = np.empty((most + 1, count, values + 1), np.float32)
+    planes[:most, :, :values], planes[most, :, :values] = rows, shift
+    planes[:most, :, values] = -(rows * shift).sum(axis=-1)
+    planes[most, :, values] = row_squares(shift) * np.float32(-0.5)
+    offsets = np.ones((len(points), values + 1), np.float32)
+    np.subtract(points, centre, out=offsets[:, :values])
+    products = multiply(planes.reshape(-1, values + 1), offsets.T).reshape(most + 1, count, len(points))
+    squared = products[most]
+    squared *= -2
+    squared += row_squares(offsets[:, :values])
+    if most:
+        inside = products[:most]
         inside *= inside
-        squared -= np.add.reduce(inside.reshape(-1, near, len(centred)), axis=0)
-    return squared
+        squared -= np.add.reduce(inside, axis=0)
+    return _two_least(squared)
+
+
+def _two_least(squared: Single) -> tuple[NDArray[np.intp], NDArray[np.intp], Single]:
+    """Rows of the least and second least value in every column (m,), and their difference. squared (J, m) is lost.
+
+    The row's number replaces the last bits of each value, so that a minimum, several times faster than an argmin, tells
+    both. That changes values by J / 2^23 of themselves at most, far less than a sweep among neighbours must tell apart.
+    """
+    count = len(squared)
+    low = np.int32((1 << (count - 1).bit_length()) - 1)
+    np.maximum(squared, 0, out=squared)  # below zero is rounding, where the order of bits would turn round
+    bits = squared.view(np.int32)
+    bits &= ~low
+    bits |= np.arange(count, dtype=np.int32)[:, None]
+    least = np.minimum.reduce(bits, axis=0)
+    best = least & low
+    if count == 1:
+        return best, best, np.zeros(len(best), np.float32)
+    bits[best, np.arange(len(best))] = np.iinfo(np.int32).max
+    second = np.minimum.reduce(bits, axis=0)
+    return best, second & low, (second & ~low).view(np.float32) - (least & ~low).view(np.float32)

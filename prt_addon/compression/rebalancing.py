@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .monitor import Tick, no_tick
 from .neighbours import Sweep
 from .seeding import fit_error, split_points
 from .subspaces import Fit, Single, Subspaces
+from .workers import SERIAL, Workers
 
 # Share of the clusters that one round moves at most.
 MOST_MOVED = 0.1
@@ -23,7 +23,7 @@ MOST_MOVED = 0.1
 DRAWN = 0.5
 
 
-def rebalance(data: Single, state: Subspaces, sweep: Sweep | None, tick: Tick = no_tick) -> int:
+def rebalance(data: Single, state: Subspaces, sweep: Sweep | None, workers: Workers = SERIAL) -> int:
     """Change labels in place by moves that lower the squared error by estimate; returns how many.
 
     sweep: the last classification of data (p, d), whose labels the fitted state still has; without one only empty
@@ -39,7 +39,7 @@ def rebalance(data: Single, state: Subspaces, sweep: Sweep | None, tick: Tick = 
         cheap = [cluster for cluster in cheap if cluster not in held]
         if moved == most or not cheap or cost[cheap[0]] >= errors[large]:
             break
-        tick()
+        workers.tick()
         small = cheap[0]
         if large in held or large == small:
             continue

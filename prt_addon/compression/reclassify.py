@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
-from .monitor import Tick, no_tick
 from .subspaces import Single, Subspaces
+from .workers import SERIAL, Workers
 
 # Points classified together: the arrays of one step stay in the cache and memory stays bounded.
 ROWS = 256
 # Clusters whose products with all bases are formed together.
 BLOCK = 16
+# Values per carried vector up to which the second bound costs more than it saves.
+NARROW = 4
 # Relative slack on bounds, so that rounding never prunes a winner.
 SLACK = 1e-3
 
@@ -44,7 +46,7 @@ class _Bases:
         return _Bases(rows, state.means, own)
 
 
-def reclassify(data: Single, state: Subspaces, tick: Tick = no_tick) -> int:
+def reclassify(data: Single, state: Subspaces, workers: Workers = SERIAL) -> int:
     """Give every point of data (p, d) to its nearest subspace, in place; returns how many points changed cluster.
 
     A point stays where it is unless another subspace is nearer; clusters without points win nothing.
@@ -52,13 +54,15 @@ def reclassify(data: Single, state: Subspaces, tick: Tick = no_tick) -> int:
     bases = _Bases.of(state)
     members = state.members()
     labels = state.labels.copy()
-    for first in range(0, len(members), BLOCK):
+
+    def classify(first: int) -> None:
         block = range(first, min(first + BLOCK, len(members)))
         offsets, apart = _offsets(state, bases, block), _mean_distances(state.means, block)
         for cluster, offset, distances in zip(block, offsets, apart, strict=True):
-            tick()
             if len(members[cluster]):
                 _reclassify_cluster(data, state, bases, members[cluster], cluster, offset, distances, labels)
+
+    workers.run(classify, range(0, len(members), BLOCK))
     changed = int((labels != state.labels).sum())
     state.labels = labels
     return changed
@@ -100,8 +104,15 @@ def _reclassify_cluster(data: Single, state: Subspaces, bases: _Bases, members: 
     gathered = np.ascontiguousarray(bases.rows[:, near])
     shift = bases.means[near] - bases.means[cluster]
     candidate = _Candidates(near, gathered, shift, apart[near], offset[:, near], plane[near])
-    inner = candidate.inner(state.bases[cluster])
     order = np.argsort(reach, kind="stable")
+    if centred.shape[1] <= NARROW * state.bases.shape[1]:
+        for start in range(0, len(order), ROWS):
+            rows = order[start:start + ROWS]
+            within = int(np.searchsorted(candidate.plane, reach[rows[-1]]))
+            if within:
+                _take(candidate.first(within), members[rows], centred[rows], own[rows], labels)
+        return
+    inner = candidate.inner(state.bases[cluster])
     for start in range(0, len(order), ROWS):
         rows = order[start:start + ROWS]
         within = int(np.searchsorted(candidate.plane, reach[rows[-1]]))
@@ -160,6 +171,13 @@ class _Candidates:
             gap -= projected.sum(axis=0)
         return gap
 
+    def first(self, within: int) -> _Candidates:
+        """The nearest of them."""
+        if within == len(self.clusters):
+            return self
+        return _Candidates(self.clusters[:within], self.rows[:, :within], self.shift[:within], self.apart[:within],
+                           self.offset[:, :within], self.plane[:within])
+
     def subset(self, chosen: NDArray[np.intp]) -> _Candidates:
         """Only the chosen candidates."""
         return _Candidates(self.clusters[chosen], self.rows[:, chosen], self.shift[chosen], self.apart[chosen],
@@ -174,8 +192,14 @@ def _full_distances(centred: Single, candidate: _Candidates, possible: NDArray[n
     if len(columns) == 0:
         return
     chosen = candidate.subset(np.flatnonzero(possible[:, columns].any(axis=1)))
-    points, offsets = points[columns], centred[columns]
-    squared = chosen._squared(chosen.rows, chosen.shift, len(chosen.clusters), offsets, row_squares(offsets))
+    _take(chosen, points[columns], centred[columns], own[columns], labels)
+
+
+def _take(chosen: _Candidates, points: NDArray[np.intp], centred: Single, own: Single,
+          labels: NDArray[np.int32]) -> None:
+    """Full distances of all points, centred (m, d) on their own mean, to the chosen subspaces; where the nearest is
+    nearer than `own` it takes the point."""
+    squared = chosen._squared(chosen.rows, chosen.shift, len(chosen.clusters), centred, row_squares(centred))
     best = squared.argmin(axis=0)
-    wins = squared[best, np.arange(len(points))] < own[columns] ** 2
+    wins = squared[best, np.arange(len(points))] < own * own
     labels[points[wins]] = chosen.clusters[best[wins]]

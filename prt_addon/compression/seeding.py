@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
-from .monitor import Tick, no_tick
 from .subspaces import SPARE, Fit, Single, fit_subspace, squared_distances
+from .workers import SERIAL, Workers
 
 # Alternations of fitting both halves and reassigning their points.
 ROUNDS = 2
@@ -76,7 +76,7 @@ def fit_error(points: Single, fit: Fit, vectors: int) -> float:
 
 
 def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width: Callable[[float], int],
-                tick: Tick = no_tick) -> tuple[NDArray[np.int32], float]:
+                workers: Workers = SERIAL) -> tuple[NDArray[np.int32], float]:
     """Labels (p,) of at most `clusters` clusters of data (p, d) and their squared error; stops early at `enough`.
 
     width: how many leading values to work on at a squared error; splits start on few values and get more.
@@ -91,7 +91,7 @@ def split_seeds(data: Single, clusters: int, vectors: int, enough: float, width:
     done: list[_Leaf] = []
     made = 1
     while queue and len(queue) + len(done) < clusters and error > enough:
-        tick()
+        workers.tick()
         leaf = heapq.heappop(queue)
         if leaf.halves is None:
             leading = max(leading, width(error))

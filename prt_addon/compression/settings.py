@@ -26,6 +26,7 @@ class EncoderSettings:
         error by some 4 % in two to three times the time.
     restarts: how many of the paper's random starts to try beside the splits; None lets the signal's size decide, and a
         target_error makes do with the splits.
+    threads: that work at the same time, 0 = one for each core; the result does not depend on it.
     """
 
     clusters: int = 256
@@ -37,6 +38,7 @@ class EncoderSettings:
     vectors_limit: int | None = None
     tolerance: float = 0.0075
     restarts: int | None = None
+    threads: int = 0
 
     def __post_init__(self) -> None:
         """Raises BadArguments where a setting makes no sense."""
@@ -54,6 +56,8 @@ class EncoderSettings:
             raise BadArguments("vectors_limit", "it is below the number of vectors", f"Use {self.vectors} or more")
         if self.restarts is not None and self.restarts < 0:
             raise BadArguments("restarts", f"{self.restarts} is not a number of starts", "Use 0 or more, or None")
+        if self.threads < 0:
+            raise BadArguments("threads", f"{self.threads} is not a number of threads", "Use 0 or more")
         if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
             raise BadArguments("tolerance", f"{self.tolerance} is not a relative decrease", "Use 0 or more")
 

@@ -16,14 +16,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..linear_algebra import multiply, row_squares, small_generalized_eigenpairs, small_symmetric_eigenpairs
-from .monitor import Tick, no_tick
+from ..linear_algebra import (
+    many_symmetric_eigenpairs,
+    multiply,
+    row_squares,
+    small_generalized_eigenpairs,
+    small_symmetric_eigenpairs,
+)
+from .workers import SERIAL, Workers
 
 # Trailing vectors carried beyond those in use: they speed up the power iteration, are ready when a vector is added, and
 # sharpen the bounds of the reclassification.
 SPARE = 2
 # Values up to which a cluster's whole eigenproblem costs less than a power step.
 NARROW = 32
+# Clusters that one thread fits at a time. Constant, so that results never depend on the threads.
+BLOCK = 16
 # Eigenvalues below this share of the largest are rounding of single-precision data.
 NEGLIGIBLE = 1e-13
 
@@ -210,7 +218,7 @@ def from_labels(labels: NDArray[np.int32], clusters: int, values: int, vectors: 
         counts=np.zeros(clusters, np.int64), scatter=np.zeros(clusters), labels=labels.astype(np.int32))
 
 
-def update(data: Single, state: Subspaces, tick: Tick = no_tick) -> float:
+def update(data: Single, state: Subspaces, workers: Workers = SERIAL) -> float:
     """Fit every subspace to its points of data (p, d), in place; returns the squared error in these values.
 
     A cluster without points keeps its subspace and counts nothing.
@@ -219,38 +227,50 @@ def update(data: Single, state: Subspaces, tick: Tick = no_tick) -> float:
     state.counts = np.diff(ends)
     block, values = state.bases.shape[1:]
     if block > 0 and values <= max(NARROW, block):
-        _solve_all(data, order, ends, state, tick)
+        _solve_all(data, order, ends, state, workers)
         return state.error
     state.spread[state.counts == 0] = 0.0
     state.scatter[state.counts == 0] = 0.0
-    for cluster in np.flatnonzero(state.counts):
-        tick()
-        fit = fit_subspace(data[order[ends[cluster]:ends[cluster + 1]]], state.bases[cluster])
-        state.means[cluster], state.bases[cluster], state.spread[cluster], state.scatter[cluster] = fit
+
+    def fit_block(clusters: NDArray[np.intp]) -> None:
+        for cluster in clusters:
+            fit = fit_subspace(data[order[ends[cluster]:ends[cluster + 1]]], state.bases[cluster])
+            state.means[cluster], state.bases[cluster], state.spread[cluster], state.scatter[cluster] = fit
+
+    workers.run(fit_block, blocks_of(np.flatnonzero(state.counts)))
     return state.error
 
 
-def _solve_all(data: Single, order: NDArray[np.intp], ends: NDArray[np.intp], state: Subspaces, tick: Tick) -> None:
-    """Exact subspaces of all clusters from their second moments in double precision, of which the means' part is taken
-    off afterwards; what can be is done for all clusters in one call."""
+def blocks_of(clusters: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Clusters in blocks of BLOCK, one piece of work for a thread each."""
+    return [clusters[first:first + BLOCK] for first in range(0, len(clusters), BLOCK)]
+
+
+def _solve_all(data: Single, order: NDArray[np.intp], ends: NDArray[np.intp], state: Subspaces,
+               workers: Workers) -> None:
+    """Exact subspaces of all clusters from their second moments about the means in double precision."""
     block, values = state.bases.shape[1:]
-    filled = np.flatnonzero(state.counts)
-    grouped = data[order].astype(np.float64)
-    counts = state.counts[filled][:, None]
-    means = np.add.reduceat(grouped, ends[filled], axis=0) / counts
-    squares, columns = np.zeros((len(filled), values)), np.empty((len(filled), values, values))
-    scatter = np.empty(len(filled))
-    for row, (start, end, mean) in enumerate(zip(ends[filled], ends[filled + 1], means, strict=True)):
-        tick()
-        points = grouped[start:end]
-        points -= mean
-        covariance = multiply(points.T, points)
-        scatter[row] = covariance.trace()
-        squares[row], columns[row] = small_symmetric_eigenpairs(covariance)
-    state.spread[:], state.scatter[:] = 0.0, 0.0
-    spread, used = squares[:, :block], min(block, values)
-    spread[spread < NEGLIGIBLE * spread[:, :1]] = 0.0
-    state.means[filled], state.scatter[filled] = means, scatter
-    state.spread[filled, :used] = spread
-    state.bases[filled] = 0.0
-    state.bases[filled, :used] = columns[:, :, :used].transpose(0, 2, 1) * (spread > 0)[:, :, None]
+    used = min(block, values)
+    empty = state.counts == 0
+    state.spread[:], state.scatter[empty] = 0.0, 0.0
+
+    def solve(clusters: NDArray[np.intp]) -> None:
+        first = ends[clusters[0]]
+        counts, starts = state.counts[clusters], ends[clusters] - first
+        grouped = data[order[first:ends[clusters[-1] + 1]]].astype(np.float64)
+        means = np.add.reduceat(grouped, starts, axis=0) / counts[:, None]
+        grouped -= np.repeat(means, counts, axis=0)
+        covariances = np.empty((len(clusters), values, values))
+        for row, (start, count) in enumerate(zip(starts, counts, strict=True)):
+            points = grouped[start:start + count]
+            multiply(points.T, points, out=covariances[row])
+        squares, rows = many_symmetric_eigenpairs(covariances)
+        spread = np.maximum(squares[:, :used], 0.0)
+        spread[spread < NEGLIGIBLE * spread[:, :1]] = 0.0
+        state.means[clusters] = means
+        state.scatter[clusters] = covariances.trace(axis1=1, axis2=2)
+        state.spread[clusters, :used] = spread
+        state.bases[clusters, :used] = rows[:, :used] * (spread > 0)[:, :, None]
+        state.bases[clusters, used:] = 0.0
+
+    workers.run(solve, blocks_of(np.flatnonzero(state.counts)))

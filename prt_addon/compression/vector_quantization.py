@@ -7,20 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
-from .monitor import Tick, no_tick
 from .subspaces import Single
+from .workers import SERIAL, Workers
 
 CHUNK = 1024
 
 
-def nearest_means(data: Single, means: Single, tick: Tick = no_tick) \
+def nearest_means(data: Single, means: Single, workers: Workers = SERIAL) \
         -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """The nearest of means (K, d) to every point of data (p, d), and its squared distance."""
     labels = np.empty(len(data), np.int32)
     squared = np.empty(len(data), np.float32)
     lengths = row_squares(means)
     for start in range(0, len(data), CHUNK):
-        tick()
+        workers.tick()
         block = data[start:start + CHUNK]
         distances = multiply(block, means.T)
         distances *= -2
@@ -42,18 +42,18 @@ def cluster_means(data: Single, labels: NDArray[np.int32], clusters: int) -> tup
     return means, counts
 
 
-def lbg(data: Single, means: Single, iterations: int, tick: Tick = no_tick) -> NDArray[np.int32]:
+def lbg(data: Single, means: Single, iterations: int, workers: Workers = SERIAL) -> NDArray[np.int32]:
     """Labels after alternating classification and means from the given start, until no point switches.
 
     data: (p, d); means: (K, d). A cluster that loses all points restarts at the point farthest from its own mean.
     """
-    labels, squared = nearest_means(data, means, tick)
+    labels, squared = nearest_means(data, means, workers)
     for _ in range(iterations):
         means, counts = cluster_means(data, labels, len(means))
         empty = np.flatnonzero(counts == 0)
         means[empty] = data[np.argsort(-squared, kind="stable")[:len(empty)]]
         before = labels
-        labels, squared = nearest_means(data, means, tick)
+        labels, squared = nearest_means(data, means, workers)
         if np.array_equal(labels, before):
             break
     return labels

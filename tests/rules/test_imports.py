@@ -19,7 +19,7 @@ from tests.rules.checkout import ROOT, Module
 
 FOLDERS = ("scene", "tracing", "basis", "transport", "compression", "lighting", "relighting", "storage", "reporting",
            "baking", "blender")
-GROUND_FLOOR = ("errors", "linear_algebra")
+GROUND_FLOOR = ("errors", "linear_algebra", "unlocked_blas")
 EVERYWHERE = {"numpy", "scipy"}
 BLENDER = {"bpy", "mathutils", "bmesh", "bpy_extras", "addon_utils", "idprop"}
 GPU = {"gpu", "gpu_extras"}
