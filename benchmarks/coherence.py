@@ -34,7 +34,6 @@ from prt_addon.transport.gather import gather_operator
 from prt_addon.transport.interreflection import interreflect
 
 ORDER, ALBEDO = 5, 0.5
-GLOSSY = Path("/tmp/glossy_signals/buddha_24x25.npy")
 # Table 1's lines below the encoders: anisotropic gloss 24 x 25, n' = 8, m_c = 256, 5 % of the squared error.
 PUBLISHED = [["paper: Buddha, 24 x 25", 0.05, 1.93, 1.72, 1.61, 1.48], ["paper: bird, 24 x 25", 0.05, 1.25, 1.23, 1.14,
                                                                        1.138]]
@@ -75,7 +74,7 @@ def main() -> None:
     """Parse the command line and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mesh", default="buddha_nirj.obj")
-    parser.add_argument("--signal", type=Path, help=f"glossy signal (.npy); without it {GLOSSY} where it exists")
+    parser.add_argument("--signal", type=Path, help="glossy signal (.npy), as benchmarks/glossy.py --write makes it")
     parser.add_argument("--rows", type=int, default=24, help="rows of the glossy signal's matrices")
     parser.add_argument("--metric", action="store_true", help="also with the glossy signal in the hemisphere's metric")
     parser.add_argument("--encoder", default="iterative", choices=METHODS)
@@ -89,8 +88,8 @@ def main() -> None:
     positions, triangles = load_obj(mesh_path(options.mesh))
     table = list(measure(f"diffuse 1 x {ORDER**2}", triangles, diffuse_signal(positions, triangles, options.directions),
                          1, None, options))
-    path = options.signal or GLOSSY
-    if path.exists():
+    path = options.signal
+    if path is not None and path.exists():
         signal = np.load(path)
         if len(signal) != len(positions):
             raise SystemExit(f"{path} has {len(signal)} rows, the mesh {len(positions)} vertices")
@@ -100,7 +99,7 @@ def main() -> None:
             functions = tuple(i for i in range(25) if options.rows != 24 or i != 2)[:options.rows]
             table += measure(f"{name}, metric", triangles, signal, options.rows, gram_matrix(functions), options)
     else:
-        print(f"skipped: no glossy signal at {path}")
+        print("skipped: no glossy signal was given")
     print(f"{len(positions)} vertices, {len(triangles)} triangles, {options.encoder}, {options.clusters} clusters, "
           f"{options.vectors} vectors, {options.registers} registers; mean overdraw")
     print_table(["signal", "share", "before", "rec", "sc", "both", "error ratio", "moved", "superclusters", "seconds"],

@@ -18,8 +18,8 @@ from ..errors import BadArguments
 from ..linear_algebra import multiply, row_squares, small_batched_multiply
 from .encoding import Encoding
 from .global_frame import metric_roots
-from .monitor import Tick, no_tick
 from .subspaces import by_cluster
+from .workers import Tick, no_tick
 
 # Points whose errors are formed together.
 CHUNK = 4096
