@@ -39,8 +39,8 @@ REACH_POINTS, OUT_OF_REACH = 128, 8.0
 # Relative decrease of the squared error below which sweeps end while vectors are still to be added, and before the
 # exact ones, in multiples of the tolerance asked for: what these sweeps leave, later ones find.
 WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
-# The same for the exact sweeps at the end, each of which costs as much as three among neighbours.
-EXACT = 4.0 / 3.0
+# The same for the exact sweeps at the end, each of which costs as much as four among neighbours.
+EXACT = 2.0
 # Most rounds of rearranging clusters.
 ROUNDS = 2
 
@@ -200,7 +200,7 @@ def polish(work: Work, state: Subspaces, enough: float) -> float:
     Clusters that lost all points restart in the worst approximated ones.
     """
     data, workers = work.frame.coordinates, work.monitor.workers
-    last, _ = settle(work, state, work.fit(state, data.shape[1]), EXACT * work.settings.tolerance)
+    last = work.fit(state, data.shape[1])
     for _ in range(work.settings.iterations):
         changed = reclassify(data, state, workers)
         error = update(data, state, workers)

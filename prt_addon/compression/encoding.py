@@ -169,8 +169,10 @@ def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.i
     """
     used, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(counts)[:-1])
-    fits = workers.run(lambda pair: principal_components(frame.coordinates[pair[1]], int(vectors[pair[0]])),
-                       list(zip(used, members, strict=True)))
+    fits = []
+    for cluster, points in zip(used, members, strict=True):
+        workers.tick()
+        fits.append(principal_components(frame.coordinates[points], int(vectors[cluster])))
     scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:

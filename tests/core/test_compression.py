@@ -14,6 +14,7 @@ from scipy import linalg
 from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
 
+from prt_addon.compression import clustered_pca
 from prt_addon.compression import global_frame as frames
 from prt_addon.compression import reclassify as classification
 from prt_addon.compression.adaptive import adaptation_pays, distribute
@@ -21,12 +22,13 @@ from prt_addon.compression.clustered_pca import disturb, iterate
 from prt_addon.compression.coherence import overdraw
 from prt_addon.compression.encoding import encode, pca, vector_quantization
 from prt_addon.compression.monitor import Monitor
-from prt_addon.compression.neighbours import Neighbours, reclassify_near
+from prt_addon.compression.neighbours import Neighbours, _two_least, reclassify_near
 from prt_addon.compression.pca import principal_components
 from prt_addon.compression.reclassify import reclassify
 from prt_addon.compression.settings import EncoderSettings
 from prt_addon.compression.subspaces import from_labels, update
 from prt_addon.compression.vector_quantization import lbg
+from prt_addon.compression.workers import Workers
 from prt_addon.errors import BadArguments, Cancelled, PRTError
 
 METHODS = ("static", "iterative", "adaptive")
@@ -399,3 +401,58 @@ def test_a_very_wide_signal_is_encoded_on_its_leading_axes_with_nothing_lost_in_
     true = float(np.sum((root[None] @ difference) ** 2))
     assert found.squared_error == pytest.approx(true, rel=1e-3)
     assert found.squared_error < 1.05 * exact.squared_error
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_result_does_not_depend_on_threads(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the last bit, also where the first splits see a part of the points only."""
+    monkeypatch.setattr(clustered_pca, "FEW_POINTS", 1000)
+    signal = surface_signal(3000, 20)
+    one, two, five = (encode(signal, quick(24, 3, method, threads=threads)) for threads in (1, 2, 5))
+    for other in (two, five):
+        np.testing.assert_array_equal(one.cluster, other.cluster)
+        np.testing.assert_array_equal(one.bases, other.bases)
+        np.testing.assert_array_equal(one.weights, other.weights)
+
+
+def test_workers_keep_the_order_and_pass_on_what_is_raised() -> None:
+    def work(number: int) -> int:
+        if number == 7:
+            raise Cancelled("bake", "stopped", "Run it again")
+        time.sleep(0.002 * (5 - number))
+        return number * number
+    with Workers(3) as workers:
+        assert workers.run(work, range(5)) == [0, 1, 4, 9, 16]
+        with pytest.raises(Cancelled):
+            workers.run(work, [0, 7, 1])
+        assert workers.run(work, [3]) == [9]
+
+
+def test_first_splits_of_a_part_of_the_points_are_as_good() -> None:
+    signal = surface_signal(20000, 12)
+    part = encode(signal, quick(32, 2)).squared_error
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(clustered_pca, "FEW_POINTS", 1 << 30)
+        whole = encode(signal, quick(32, 2)).squared_error
+    assert part < 1.05 * whole
+
+
+def test_a_target_out_of_reach_costs_no_error() -> None:
+    """The splits that stop at a target are not those that lead to the least error; they are left where it is far."""
+    signal = surface_signal(20000, 25)
+    free = encode(signal, quick(64, 3))
+    asked = encode(signal, quick(64, 3, target_error=free.relative_error / 100))
+    assert asked.squared_error == free.squared_error
+    near = encode(signal, quick(64, 3, target_error=free.relative_error * 4))
+    assert near.relative_error <= free.relative_error * 4
+    assert near.storage_cost < free.storage_cost
+
+
+def test_two_least_equals_sorting() -> None:
+    squared = np.random.default_rng(0).gamma(1.0, size=(37, 500)).astype(np.float32)
+    order, rows = np.sort(squared, axis=0), np.argsort(squared, axis=0)
+    best, second, rise = _two_least(squared.copy())
+    apart = order[1] > order[0] * (1 + 1e-4), order[2] > order[1] * (1 + 1e-4)
+    assert (best == rows[0])[apart[0]].all() and (second == rows[1])[apart[0] & apart[1]].all()
+    np.testing.assert_allclose(rise, order[1] - order[0], atol=2e-5 * order[1].max())
+    assert (_two_least(squared[:1].copy())[0] == 0).all()
