@@ -22,7 +22,7 @@ Array = NDArray[np.floating]
 
 _SINGLE = np.dtype(np.float32)
 # Multiplications from which on giving up the lock of Python, for other threads to run, gains more than it costs.
-UNLOCKED_WORK = 250_000
+UNLOCKED_WORK = 2_000_000
 
 
 def _same_type(*arrays: Array) -> np.dtype:

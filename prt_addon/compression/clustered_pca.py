@@ -19,7 +19,7 @@ from .rebalancing import exchange, rebalance
 from .reclassify import reclassify
 from .seeding import split_seeds
 from .settings import EncoderSettings
-from .subspaces import SPARE, Single, Subspaces, from_labels, update
+from .subspaces import NARROW, SPARE, Single, Subspaces, from_labels, update
 from .vector_quantization import lbg, random_means
 from .workers import Workers
 
@@ -95,7 +95,9 @@ def split_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, mo
                                 lambda _: width, monitor.workers)
         return from_labels(labels, int(labels.max()) + 1, width, vectors)
     vectors = min(seed_vectors, settings.vectors)
-    part, scale = _random_part(frame, settings, settings.clusters * SEED_POINTS)
+    narrow = frame.coordinates.shape[1] <= NARROW  # elsewhere splits cost little beside the rest
+    most = settings.clusters * SEED_POINTS if narrow else len(frame.coordinates)
+    part, scale = _random_part(frame, settings, most)
     labels, error = split_seeds(part, settings.clusters, vectors, enough / scale,
                                 lambda error: frame.leading(SEED_TRUNCATION * error * scale), monitor.workers)
     width = frame.leading(TRUNCATION * error * scale)

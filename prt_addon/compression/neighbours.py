@@ -7,18 +7,21 @@ be exact, as only the state that they lead to counts; `reclassify` is.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import multiply, row_squares
-from .subspaces import Single, Subspaces, by_cluster
+from .subspaces import NARROW, Single, Subspaces, by_cluster
 from .workers import SERIAL, Workers
 
 # Subspaces of the nearest means among which a point is classified, its own included, and others that take turns.
 NEAREST, OTHERS, STRIDE = 12, 6, 6
 MEMORY = 0.5
+# Clusters whose neighbours' vectors are gathered together.
+BLOCK = 16
 # Clusters at most that share their lists, points classified in one product, groups that a thread takes at a time.
 # Not a power of two: columns that far apart would share the same few lines of the cache.
 GROUP, ROWS, TOGETHER = 4, 1000, 4
@@ -65,32 +68,98 @@ class Neighbours:
                 clusters, clusters)
 
 
+class _Found(NamedTuple):
+    """Of every point its nearest subspace, the second nearest, and by how much that is farther (squared): (p,) each."""
+
+    labels: NDArray[np.int32]
+    runner_up: NDArray[np.int32]
+    rise: Single
+
+
 def reclassify_near(data: Single, state: Subspaces, lists: NDArray[np.intp], workers: Workers = SERIAL) -> Sweep:
     """Give every point of data (p, d) to the nearest of the subspaces on its cluster's list, in place.
 
-    Clusters whose means are near share the subspaces on all their lists: a few large products instead of many small
-    ones are faster, in threads above all, and more subspaces are tried.
+    In few values, clusters whose means are near share the subspaces on all their lists: a few large products instead of
+    many small ones go well in threads, and more subspaces are tried. In many values that arithmetic costs too much.
     """
     order, ends = by_cluster(state.labels, len(state.means))
+    members = [order[start:end] for start, end in itertools.pairwise(ends)]
+    found = _Found(state.labels.copy(), state.labels.copy(), np.zeros(len(order), np.float32))
+    classify = _classify_groups if state.means.shape[1] <= NARROW else _classify_alone
+    classify(data, state, lists, members, found, workers)
+    cost = np.bincount(found.labels, found.rise, len(lists))
+    changed = int((found.labels != state.labels).sum())
+    state.labels = found.labels
+    return Sweep(changed, found.runner_up, cost)
+
+
+def _classify_groups(data: Single, state: Subspaces, lists: NDArray[np.intp], members: list[NDArray[np.intp]],
+                     found: _Found, workers: Workers) -> None:
+    """Clusters in groups. members: the points of each cluster."""
     rows = state.vector_major()
-    labels, runner_up = state.labels.copy(), state.labels.copy()
-    rise = np.zeros(len(order), np.float32)
 
     def classify(groups: list[NDArray[np.intp]]) -> None:
         for group in groups:
-            points = np.concatenate([order[ends[cluster]:ends[cluster + 1]] for cluster in group])
+            points = np.concatenate([members[cluster] for cluster in group])
             tried = np.unique(lists[group])
             for start in range(0, len(points), ROWS):
                 part = points[start:start + ROWS]
-                best, second, rise[part] = _two_nearest(data[part], state.means[tried], rows[:, tried])
-                labels[part], runner_up[part] = tried[best], tried[second]
+                best, second, found.rise[part] = _two_nearest(data[part], state.means[tried], rows[:, tried])
+                found.labels[part], found.runner_up[part] = tried[best], tried[second]
 
     groups = _neighbouring(state.means, np.flatnonzero(state.counts))
     workers.run(classify, [groups[first:first + TOGETHER] for first in range(0, len(groups), TOGETHER)])
-    cost = np.bincount(labels, rise, len(lists))
-    changed = int((labels != state.labels).sum())
-    state.labels = labels
-    return Sweep(changed, runner_up, cost)
+
+
+def _classify_alone(data: Single, state: Subspaces, lists: NDArray[np.intp], members: list[NDArray[np.intp]],
+                    found: _Found, workers: Workers) -> None:
+    """One cluster after the other. Not in threads: their many small products would pass Python's lock back and forth,
+    which costs more than it gains."""
+    rows = state.vector_major()
+    columns = np.arange(int(state.counts.max()))
+    for first in range(0, len(lists), BLOCK):
+        planes, offsets, lengths = _planes(state.means, rows, lists[first:first + BLOCK], first)
+        for index in range(len(planes)):
+            cluster, points = first + index, members[first + index]
+            if len(points) == 0:
+                continue
+            workers.tick()
+            squared = _squared(data[points] - state.means[cluster], planes[index], offsets[index], lengths[index])
+            least, here = squared.argmin(axis=0), columns[:len(points)]
+            found.labels[points] = found.runner_up[points] = lists[cluster, least]
+            if lists.shape[1] > 1:
+                nearest = squared[least, here]
+                squared[least, here] = np.inf
+                least = squared.argmin(axis=0)
+                found.rise[points] = squared[least, here] - nearest
+                found.runner_up[points] = lists[cluster, least]
+
+
+def _planes(means: Single, rows: Single, lists: NDArray[np.intp], first: int) -> tuple[Single, Single, Single]:
+    """For a block of clusters from `first`, of the subspaces j on their lists (b, J): per cluster the rows of all
+    vectors of the j and at last mean_j - mean ((q + 1) J, d); the vectors' products with that (q J, 1); its squared
+    length (J, 1)."""
+    block, _near = lists.shape
+    shift = means[lists] - means[first:first + block, None]
+    planes = np.concatenate([rows[:, lists], shift[None]]).transpose(1, 0, 2, 3)
+    planes = np.ascontiguousarray(planes)
+    offsets = (planes[:, :-1] * shift[:, None]).sum(axis=-1)
+    return planes.reshape(block, -1, means.shape[1]), offsets.reshape(block, -1, 1), row_squares(shift)[:, :, None]
+
+
+def _squared(centred: Single, planes: Single, offsets: Single, lengths: Single) -> Single:
+    """Squared distances (J, m), less the points' own squared lengths, of points centred (m, d) to subspaces that
+    `_planes` prepared."""
+    near = len(lengths)
+    products = multiply(planes, centred.T)
+    squared = products[len(offsets):] * np.float32(-2)
+    squared += lengths
+    if len(offsets):
+        inside = products[:len(offsets)]
+        inside -= offsets
+        inside *= inside
+        squared -= np.add.reduce(inside.reshape(-1, near, len(centred)), axis=0)
+    return squared
 
 
 def nearest_of_all(data: Single, state: Subspaces, workers: Workers = SERIAL) -> NDArray[np.int32]:
