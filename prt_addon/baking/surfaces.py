@@ -45,7 +45,8 @@ class SurfacePart:
     kernel: (rows, incident functions, 1 or 3), None where it has no rows of its own; window: (columns,) factors on the
     light that a highlight sharper than the light's order reflects; diffuse_share: of its diffuse
     layer that the layers above leave, a mean over views; dimming: (rows,) how that differs over views; highlight:
-    (3,) mean share of the light that its highlight returns; translucent: subsurface light is baked.
+    (3,) mean share of the light that its highlight returns; translucent: subsurface light is baked; subsurface_share:
+    of it that leaves, what is no metal and what the highlight lets through.
     """
 
     material: SurfaceMaterial
@@ -55,6 +56,7 @@ class SurfacePart:
     dimming: NDArray[np.float64]
     highlight: NDArray[np.float64]
     translucent: bool
+    subsurface_share: float
 
 
 @dataclass(frozen=True)
@@ -163,8 +165,9 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
         left_out.append(LeftOut(f"subsurface light of material {material.name}", "subsurface is false",
                                 "the subsurface stage and three channels"))
     through = 1.0 - material.subsurface_weight if translucent else 1.0
+    inside = material.subsurface_weight * (1.0 - material.metallic)
     if functions is None:
-        return SurfacePart(material, None, np.ones(1), through, np.zeros(1), highlight, translucent)
+        return SurfacePart(material, None, np.ones(1), through, np.zeros(1), highlight, translucent, inside)
     kernel = reflection_matrix(reflection, functions, np.arange(INCIDENT_ORDER ** 2), SMALLEST_INCIDENT)
     if kernel.shape[2] == 3 and np.ptp(kernel, axis=2).max() <= _GREY * np.abs(kernel).max():
         kernel = kernel[:, :, :1]
@@ -175,7 +178,7 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
                      f" window leaves {bands[-1]:.0%} of the highest band (glossy_window=false keeps all)")
     window = expand_bands(bands)
     return SurfacePart(material, kernel, window, left.mean * through, left.coefficients * through, highlight,
-                       translucent)
+                       translucent, inside * left.mean)
 
 
 def row_metric(functions: Indices, albedo: NDArray[np.float32]) -> NDArray[np.float64] | None:

@@ -50,7 +50,7 @@ def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: N
                 yield (index + next(steps)) / len(bodies)
         except StopIteration as end:
             light = end.value
-        weight = np.float32(material.subsurface_weight)
+        weight = np.float32(surfaces.parts[number].subsurface_share)
         result.append(BodyLight(target.name, points, material.name, light, light.transfer * weight))
     return result
 

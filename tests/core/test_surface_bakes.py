@@ -105,6 +105,15 @@ def test_wax_returns_its_colour_in_a_white_world_and_lets_light_through():
     assert any("tree over wax" in check["check"] for check in result.report["stability"])
 
 
+def test_layers_of_wax_metal_and_highlight_share_the_light():
+    """White in every layer, half of it metal: no more leaves than came."""
+    mixed = replace(WAX, base_colour=(1.0, 1.0, 1.0), metallic=0.5, specular_level=0.5, roughness=0.5,
+                    subsurface_radius=(0.05, 0.05, 0.05))
+    container = baked(replace(sphere(subdivisions=3, albedo=(0.5,) * 3), materials=(mixed,))).objects["sphere"]
+    for degrees in (0.0, 45.0):
+        np.testing.assert_allclose(seen(container, degrees), 1.0, atol=0.03)
+
+
 def test_what_is_left_out_is_said():
     mesh = replace(sphere(subdivisions=2, albedo=(0.6, 0.6, 0.6)), materials=(PLASTIC,))
     faint = baked(mesh)  # 6 % of the light is less than the preset asks for
