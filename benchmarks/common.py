@@ -77,3 +77,17 @@ def print_table(header: list[str], rows: list[list[Any]]) -> None:
     print("|" + " --- |" * len(header))
     for row in rows:
         print("| " + " | ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) + " |")
+
+
+COLOURS = ("#2a6f97", "#c8553d", "#588157", "#9c6644", "#7b5ea7")
+STYLE = ("<style>svg{background:#fff}text{font:13px sans-serif;fill:#23272e}.quiet{fill:#69707c}.small{font-size:11px}"
+         ".grid{stroke:#dedcd6}.curve{fill:none;stroke-width:2}"
+         + "".join(f".curve.series-{name}{{stroke:{colour}}}.mark.series-{name}{{fill:{colour}}}"
+                   for name, colour in zip("abcde", COLOURS, strict=True)) + "</style>")
+
+
+def save_plot(path: Path, picture: str) -> None:
+    """An inline SVG of reporting.svg_plots as a file of its own."""
+    picture = picture.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(picture.replace("<title>", STYLE + "<title>", 1))

@@ -16,18 +16,12 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the bake's process; before numpy loads
 
-from common import ROOT, load_obj, mesh_path, print_table, smooth_object
+from common import ROOT, load_obj, mesh_path, print_table, save_plot, smooth_object
 
 from prt_addon.baking.recipe import bake, exhaust
 from prt_addon.baking.settings import PRESETS, BakeSettings
 from prt_addon.reporting.svg_plots import Curve, curves
 from prt_addon.scene.scene_mesh import SceneMesh
-
-COLOURS = ("#2a6f97", "#c8553d", "#588157", "#9c6644", "#7b5ea7")
-STYLE = ("<style>svg{background:#fff}text{font:13px sans-serif;fill:#23272e}.quiet{fill:#69707c}.small{font-size:11px}"
-         ".grid{stroke:#dedcd6}.curve{fill:none;stroke-width:2}"
-         + "".join(f".curve.series-{name}{{stroke:{colour}}}.mark.series-{name}{{fill:{colour}}}"
-                   for name, colour in zip("abcde", COLOURS, strict=True)) + "</style>")
 
 
 def run(scene: SceneMesh, label: str, settings: BakeSettings) -> list[object]:
@@ -61,10 +55,7 @@ def main() -> None:
         drawn += [Curve(f"compression, {e}", [(row[1], row[4] / 100.0) for row in encoders if row[0].startswith(e)])
                   for e in ("static", "iterative", "adaptive")]
         picture = curves(drawn, "seconds", "relative RMS error", f"Error against run time, {arguments.mesh}")
-        picture = picture.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
-        path = ROOT / arguments.plot
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(picture.replace("<title>", STYLE + "<title>", 1))
+        save_plot(ROOT / arguments.plot, picture)
 
 
 if __name__ == "__main__":
