@@ -133,7 +133,7 @@ def small_symmetric_eigenpairs(matrix: Array) -> tuple[Array, Array]:
     """All eigenvalues, descending, and eigenvectors as columns of a small symmetric matrix, in double precision.
 
     LAPACK's driver without scipy's checks, which cost ten times the solution at sizes below about 20. Signs as LAPACK
-    leaves them. Raises ValueError where LAPACK does not converge (NaN or infinity in the matrix).
+    leaves them. Raises ValueError where LAPACK says that it did not converge. NaN or infinity may pass unnoticed: callers check.
     """
     values, vectors, status = lapack.dsyevd(matrix)
     if status != 0:
@@ -143,7 +143,8 @@ def small_symmetric_eigenpairs(matrix: Array) -> tuple[Array, Array]:
 
 def many_symmetric_eigenpairs(matrices: NDArray[np.float64]) -> tuple[Array, Array]:
     """All eigenvalues, descending (k, n), and eigenvectors as rows (k, n, n) of small symmetric matrices (k, n, n), in
-    double precision, without Python's lock. Signs as LAPACK leaves them; raises ValueError where it does not converge.
+    double precision, without Python's lock. Signs as LAPACK leaves them; raises ValueError where it says that it did
+    not converge; NaN or infinity may pass unnoticed.
     """
     if unlocked_blas.available:
         vectors = np.array(matrices, np.float64, order="C")

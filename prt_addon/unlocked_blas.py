@@ -65,7 +65,7 @@ def gemm(a: NDArray, b: NDArray, out: NDArray, accumulate: bool = False) -> None
 def eigenpairs_in_place(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """Ascending eigenvalues (k, n) of symmetric matrices (k, n, n), C-ordered, whose rows become the eigenvectors.
 
-    Raises ValueError where LAPACK does not converge (NaN or infinity).
+    Raises ValueError where LAPACK says that it did not converge; NaN or infinity may pass unnoticed.
     """
     count, size = matrices.shape[:2]
     values = np.empty((count, size))
