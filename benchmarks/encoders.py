@@ -5,8 +5,8 @@
     python benchmarks/encoders.py --signal transfer.npy --clusters 256 --vectors 8 --plain
 
 Bakes nothing: reads points x values float32, or makes a smooth-surface signal with shadow edges. Seconds are this
-process's own on the processor, all threads together, so that other load on the machine disturbs them less; run with one BLAS thread
-(OPENBLAS_NUM_THREADS=1) to compare. Ratios count, not seconds.
+process's own on the processor, all threads together, so that other load on the machine disturbs them less; run with one
+BLAS thread (OPENBLAS_NUM_THREADS=1) to compare. Ratios count, not seconds.
 """
 
 from __future__ import annotations

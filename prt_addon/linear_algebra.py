@@ -133,7 +133,8 @@ def small_symmetric_eigenpairs(matrix: Array) -> tuple[Array, Array]:
     """All eigenvalues, descending, and eigenvectors as columns of a small symmetric matrix, in double precision.
 
     LAPACK's driver without scipy's checks, which cost ten times the solution at sizes below about 20. Signs as LAPACK
-    leaves them. Raises ValueError where LAPACK says that it did not converge. NaN or infinity may pass unnoticed: callers check.
+    leaves them. Raises ValueError where LAPACK says that it did not converge; NaN or infinity may pass
+    unnoticed: callers check.
     """
     values, vectors, status = lapack.dsyevd(matrix)
     if status != 0:
