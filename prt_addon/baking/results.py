@@ -31,6 +31,8 @@ REPORT_SCHEMA = 1
 ENERGY_LIMIT = 1.02
 # An object most of whose receivers see no sky and no surface that does is probably wound inwards.
 DARK_LIMIT = 0.5
+# The dipole is a half-space's: a body that loses more of its light by its sides looks like another material.
+LOST_LIMIT = 0.25
 
 
 def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, shape: tuple[int, int, int],
@@ -111,6 +113,8 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
                              0.02, "ok", "light through it is inexact"))
         checks.append(_check(f"energy that thin parts of {name} had to lose", float(body.light.reduced.max()), 0.05,
                              "ok", "thinner than its mean free path: the dipole does not hold there"))
+        checks.append(_check(f"light that {name} loses by its sides", body.lost, LOST_LIMIT, "ok",
+                             "too dark, small against its mean free path: lower the Subsurface Scale"))
     return checks
 
 

@@ -10,21 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.scene_mesh import SceneMesh, SceneObject
-from ..transport.dipole import Medium
+from ..transport.dipole import Medium, total_reflectance
 from ..transport.subsurface import Subsurface, subsurface_transfer
 from .surfaces import SurfacePlan
+
+# A channel that returns less of the light than this has none to lose.
+DARKEST = 1e-3
 
 
 @dataclass(frozen=True)
 class BodyLight:
     """target: the object's name; points: (k,) places among its points; material: its name; light: of the medium, for
-    a subsurface weight of 1; transfer: (k, columns, 3) float32 exit radiance, weight included."""
+    a subsurface weight of 1; transfer: (k, columns, 3) float32 exit radiance, weight included; lost: largest share, of
+    the channels, of what a thick body of the medium returns of uniform light that this one does not return."""
 
     target: str
     points: NDArray[np.int64]
     material: str
     light: Subsurface
     transfer: NDArray[np.float32]
+    lost: float
 
 
 def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: NDArray[np.bool_],
@@ -51,8 +56,15 @@ def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: N
         except StopIteration as end:
             light = end.value
         weight = np.float32(surfaces.parts[number].subsurface_share)
-        result.append(BodyLight(target.name, points, material.name, light, light.transfer * weight))
+        result.append(BodyLight(target.name, points, material.name, light, light.transfer * weight,
+                                _lost(medium, light)))
     return result
+
+
+def _lost(medium: Medium, light: Subsurface) -> float:
+    """Of uniform light, the share of a half-space's that the body does not return; the largest of the channels."""
+    thick = total_reflectance(medium.x, medium.boundary)
+    return float(np.max(1.0 - light.energy / np.maximum(thick, DARKEST), where=thick > DARKEST, initial=0.0))
 
 
 def point_areas(scene: SceneMesh, target: SceneObject) -> NDArray[np.float64]:

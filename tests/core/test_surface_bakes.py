@@ -129,6 +129,20 @@ def test_what_is_left_out_is_said():
         make_settings("standard", {"glossy_rows": "7"})
 
 
+def test_a_body_small_against_its_mean_free_path_is_reported():
+    """It returns little of the light: dark in the picture, and the dipole's fault."""
+    def lost(radius):
+        wax = replace(WAX, subsurface_radius=(radius,) * 3)
+        result = baked(replace(sphere(subdivisions=2, albedo=WAX.base_colour), materials=(wax,)), bounces=0)
+        check, = (c for c in result.report["stability"] if "loses by its sides" in c["check"])
+        return check["value"], check["verdict"]
+
+    value, verdict = lost(1000.0)
+    assert value > 0.99 and "Subsurface Scale" in verdict
+    value, verdict = lost(0.05)
+    assert abs(value) < 0.05 and verdict == "ok"
+
+
 def test_an_interrupted_bake_resumes_with_the_same_result(tmp_path):
     meshes = [replace(sphere(subdivisions=2, albedo=(0, 0, 0), centre=(0, 0, 1.2)), materials=(GOLD,)),
               plane(size=6.0, cells=8, albedo=(0.5, 0.4, 0.3))]
