@@ -35,6 +35,8 @@ SMALLEST_INCIDENT = 3e-2
 CONSTANT = 0.5 / np.sqrt(np.pi)
 # Mean square of the albedo below which a black surface's diffuse row is still kept right, for materials edited later.
 DARKEST = 1e-4
+# Share of the light below which a metal is left black whatever its preset: nobody misses its highlight.
+BLACK_METAL = 0.03
 _GREY = 1e-6
 
 
@@ -142,7 +144,9 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
     if settings.glossy_rows == 0:
         left_out.append(LeftOut(name, "glossy_rows is 0", f"view-dependent rows; it returns {albedo:.1%} of the light"))
         return 0
-    if albedo < settings.glossy_albedo:
+    # A metal has less of a diffuse layer to leave its light to, or none: it would be drawn black.
+    least = max(settings.glossy_albedo * (1.0 - material.metallic), min(settings.glossy_albedo, BLACK_METAL))
+    if albedo < least:
         left_out.append(LeftOut(name, f"it returns {albedo:.1%} of the light, less than glossy_albedo",
                                 "view-dependent rows"))
         return 0

@@ -143,6 +143,19 @@ def test_a_body_small_against_its_mean_free_path_is_reported():
     assert abs(value) < 0.05 and verdict == "ok"
 
 
+def test_a_dark_metal_keeps_its_highlight_and_a_dark_plastic_does_not():
+    """A metal has no diffuse layer that its light could stay in: without rows it would be drawn black."""
+    mesh = sphere(subdivisions=2, albedo=(0, 0, 0))
+    steel = replace(METAL, base_colour=(0.2, 0.2, 0.2))
+    result = baked(replace(mesh, materials=(steel,)), glossy_albedo=0.3, order=4)
+    assert result.objects["sphere"].functions
+    assert seen(result.objects["sphere"], 0.0).mean() > 0.17
+    assert not baked(replace(mesh, materials=(replace(PLASTIC, specular_level=1.0),)),
+                     glossy_albedo=0.3).objects["sphere"].functions
+    black = replace(METAL, base_colour=(0.0, 0.0, 0.0))
+    assert not baked(replace(mesh, materials=(black,))).objects["sphere"].functions
+
+
 def test_an_interrupted_bake_resumes_with_the_same_result(tmp_path):
     meshes = [replace(sphere(subdivisions=2, albedo=(0, 0, 0), centre=(0, 0, 1.2)), materials=(GOLD,)),
               plane(size=6.0, cells=8, albedo=(0.5, 0.4, 0.3))]
