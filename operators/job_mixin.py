@@ -25,6 +25,8 @@ STAGES = {
     "gather": "Finding surfaces that light each other",
     "direct": "Shadows",
     "interreflection": "Bounced light",
+    "glossy": "Highlights",
+    "subsurface": "Light through bodies",
     "encode": "Compressing",
     "errors": "Measuring the error",
 }

@@ -11,6 +11,8 @@ STAGES = {
     "gather": ("Look for bounces", "rays from every point find the surfaces that send light back to it"),
     "direct": ("Shadows", "rays from every point find out which parts of the sky it can see"),
     "interreflection": ("Bounce light", "light is passed from surface to surface until too little is left to matter"),
+    "glossy": ("Highlights", "the same rays tell what shiny surfaces reflect towards each direction of view"),
+    "subsurface": ("Light through bodies", "light that enters a translucent surface is followed to where it leaves"),
     "encode": ("Compress", "points that react to light alike are put into clusters that share their data"),
     "errors": ("Measure the error", "independent light paths at random points check the result; it changes nothing"),
 }

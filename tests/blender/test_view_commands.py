@@ -4,16 +4,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
+from prt_addon.baking.plan import make_plan
+from prt_addon.baking.settings import make_settings
 from prt_addon.blender import stored
 from prt_addon.relighting.exit_radiance import view_radiance
+from prt_addon.reporting import wording
+from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.scene.surface_material import SurfaceMaterial
 from tests.blender.test_commands import run  # makes the checkout the package `prt`
 from tests.blender.test_stored import ROW_SETS, add_smooth_sphere, bake_of
+from tests.core.shapes import sphere
 
 
 @pytest.fixture
@@ -58,3 +65,13 @@ def test_preview_draws_it(glossy: tuple[Path, object], tmp_path: Path) -> None:
     if code == 1:
         pytest.skip("no graphics driver")
     assert code == 0 and (tmp_path / "p.png").is_file()
+
+
+def test_every_stage_of_a_bake_has_a_name_on_screen_and_in_the_report() -> None:
+    from prt.operators.job_mixin import STAGES
+
+    material = SurfaceMaterial("wax metal", metallic=0.5, specular_level=0.5, subsurface_weight=0.5,
+                               subsurface_radius=(1.0, 1.0, 1.0))
+    scene = SceneMesh.assemble([replace(sphere(subdivisions=1, albedo=(0.5, 0.5, 0.5)), materials=(material,))])
+    stages = make_plan(scene, make_settings("draft", {"bounces": "1"}), None).seconds
+    assert {"glossy", "subsurface"} <= stages.keys() <= STAGES.keys() & wording.STAGES.keys()
