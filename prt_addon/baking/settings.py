@@ -31,8 +31,8 @@ class BakeSettings:
     spacing: longest triangle edge as a fraction of the baked objects' diagonal; coarser triangles are refined; 0 = off.
     rotation_group: receivers that share one random rotation of the directions; 0 = all share one set, unrotated.
     error_receivers, error_paths: receivers, and paths from each, of the reference that measures the error; 0 = none.
-    glossy_rows: most functions of the view direction that a highlight gets (4, 9, 16, 24 or 25); 0 = none: materials
-        are diffuse. Each row costs as much as the whole diffuse transfer.
+    glossy_rows: most functions of the view direction that a highlight gets (4, 9, 16, 24 or 25); 0 = none: only
+        diffuse light is drawn, metals are black. Each row costs as much as the whole diffuse transfer.
     glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
         most); below, its light stays in the diffuse layer.
     glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
