@@ -142,8 +142,8 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
     name = f"the highlight of material {material.name or 'without name'}"
     albedo = float(reflection.albedo().max())
     if settings.glossy_rows == 0:
-        left_out.append(LeftOut(name, "glossy_rows is 0" + (": metal is drawn black" if material.metallic > 0.5 else ""),
-                                f"view-dependent rows; it returns {albedo:.1%} of the light"))
+        why = "glossy_rows is 0: metal is drawn black" if material.metallic > 0.5 else "glossy_rows is 0"
+        left_out.append(LeftOut(name, why, f"view-dependent rows; it returns {albedo:.1%} of the light"))
         return 0
     # A metal has less of a diffuse layer to leave its light to, or none: it would be drawn black.
     least = max(settings.glossy_albedo * (1.0 - material.metallic), min(settings.glossy_albedo, BLACK_METAL))
