@@ -111,7 +111,7 @@ def figure_10(cache: Path) -> None:
     errors = {"CPCA 256 x 8": timed(signal, 256, 8, "iterative")[1], "PCA 1 x 20": pca(signal, 20).squared_error,
               "VQ 1,792": vector_quantization(signal, 1792).squared_error}
     best = errors["CPCA 256 x 8"]
-    print_table(["encoder", "squared error", "times CPCA's", "paper"],
+    print_table(["encoder", "squared error", "times CPCA's", "paper (its bird)"],
                 [[name, error, error / best, paper]
                  for (name, error), paper in zip(errors.items(), ("1", "344", "50"), strict=True)])
 
