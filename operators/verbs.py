@@ -161,10 +161,8 @@ ARRAYS = {
 
 
 def _settings(arguments: argparse.Namespace) -> BakeSettings:
-    if arguments.lighting == "local":
-        raise BadArguments("--lighting local", "light clouds for local lights are not part of this version",
-                           "Use --lighting environment, which covers the World and Suns")
-    return make_settings(arguments.preset, dict(arguments.overrides))
+    chosen = {} if arguments.lighting is None else {"lighting": arguments.lighting}
+    return make_settings(arguments.preset, chosen | dict(arguments.overrides))
 
 
 def _open(path: Path) -> bpy.types.Scene:

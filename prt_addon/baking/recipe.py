@@ -11,7 +11,7 @@ import time
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,8 @@ from .surfaces import CONSTANT, INCIDENT_ORDER, row_metric
 from .translucency import BodyLight, light_through_bodies
 
 POLL_SECONDS = 0.05
+# Shadow rays of a bake for local lights alone, where distant light only checks the scene.
+DIRECTIONS_OF_CHECKS = 256
 # Receivers whose layers leave less of the diffuse one than this say nothing about its error.
 LEAST_DIFFUSE = 0.05
 # Share of glossy surfaces among what glossy receivers see from which on their light is followed by its direction.
@@ -77,13 +79,19 @@ Steps = Generator[Progress, None, Any]
 
 def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
          light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
-         ) -> Generator[Progress, None, BakeResult]:
+         regions: NDArray[np.float64] | None = None) -> Generator[Progress, None, BakeResult]:
     """Yield progress and return the result.
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
-    in the headers. Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
+    scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}).run())
+    if not settings.distant_light:
+        # A white sky of one coefficient still tells what is buried, dark, or brighter than it can be.
+        settings = replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS),
+                           error_receivers=0, glossy_rows=0, subsurface=False)
+    regions = np.empty((0, 4, 4)) if regions is None else regions
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions).run())
 
 
 @dataclass
@@ -95,6 +103,7 @@ class _Bake:
     folder: Path | None
     light: ReferenceLight | None
     digests: dict[str, str]
+    regions: NDArray[np.float64]
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
