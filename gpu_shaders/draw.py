@@ -84,13 +84,14 @@ class ObjectDrawing:
             self._plain_batch = _make_batch(plain_surface(self.data))
 
     def add_direct(self, values: NDArray[np.float32] | None) -> None:
-        """Direct light (points, 3) for unit albedo to add from now on; None for none."""
+        """Direct light (points, rows, 3), for unit albedo in row 0, to add from now on; None for none."""
         if values is self._direct_values:
             return
-        if values is not None and values.shape != (self.data.points, 3):
-            raise ValueError(f"direct light has shape {values.shape}, the drawn data needs ({self.data.points}, 3)")
+        expected = (self.data.points, self.data.rows, 3)
+        if values is not None and values.shape != expected:
+            raise ValueError(f"direct light has shape {values.shape}, the drawn data needs {expected}")
         self._direct_values = values
-        self._direct = None if values is None else make_texture(texture_values(values))
+        self._direct = None if values is None else make_texture(texture_values(values.reshape(-1, 3)))
 
     def exit_radiances(self) -> NDArray[np.float32]:
         """The exit radiances on the GPU for unit albedo, (points, rows, 3). Waits for the GPU: for tests and export."""

@@ -102,6 +102,7 @@ def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     info.push_constant("FLOAT", "exposure")
     info.push_constant("FLOAT", "albedo_share")
     fetch, total = hemisphere_glsl.fetch_rows(functions), hemisphere_glsl.sum_rows(functions)
+    fetch += hemisphere_glsl.add_direct_rows(functions)
     turn = hemisphere_glsl.turn_rows(functions)
     info.vertex_source("\n".join([_source("texel_layout.glsl"), fetch, turn, _source("view_surface.vert.glsl")]))
     info.fragment_source("\n".join([total, _source("view_surface.frag.glsl")]))

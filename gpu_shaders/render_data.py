@@ -38,8 +38,8 @@ class DrawItem:
     light: (columns, 3), coefficients in the lighting basis of the bake, or (zones, columns, 3) where a light cloud takes
         part (`relighting.scene_light.joined_light`); more columns than a bake for distant light has are left out
         (spherical harmonics of a higher order).
-    direct: (points, 3) float32, radiance for unit albedo to add: direct light of lamps, which no bake holds. Never
-        changed in place: another array means other light.
+    direct: (points, rows, 3) float32, what lamps add to the exit radiance: their direct light, which no bake holds.
+        Never changed in place: another array means other light.
     exposure: factor on the radiance. stale: drawn dimmed, because the object was edited after its bake.
     heat: (points,) in 0..1 shown as false colours in place of the radiance, or None.
     """

@@ -5,13 +5,13 @@
 // Without SEES_VIEWER the constant function is the only one (subsurface light).
 void main()
 {
-  int receiver = int(receiver_and_turn.x + 0.5);
-  int first_texel = receiver * ROWS;
+  int first_texel = int(receiver_and_turn.x + 0.5) * ROWS;
   diffuse_radiance = texelFetch(exit_values, texel(first_texel), 0).rgb;
-  if (direct_share > 0.0) {
-    diffuse_radiance += texelFetch(direct_values, texel(receiver), 0).rgb;
-  }
   fetch_rows(first_texel);
+  if (direct_share > 0.0) {
+    diffuse_radiance += texelFetch(direct_values, texel(first_texel), 0).rgb;
+    add_direct_rows(first_texel);
+  }
   if (receiver_and_turn.y != 0.0) {
     turn_rows(receiver_and_turn.y);
   }

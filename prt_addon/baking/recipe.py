@@ -22,6 +22,7 @@ from scipy import sparse
 from ..basis.directions import quadrature
 from ..compression.coherence import Coherence, make_coherent
 from ..compression.encoding import Encoding, encode
+from ..compression.groups import encode_groups
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
@@ -43,8 +44,9 @@ from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
+from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
 from .plan import Plan, make_plan, most_clusters
-from .results import object_container, report_of, stability_of, surface_checks
+from .results import LocalColumns, object_container, report_of, stability_of, surface_checks
 from .settings import BakeSettings
 from .surfaces import CONSTANT, INCIDENT_ORDER, row_metric
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
@@ -111,6 +113,9 @@ class _Bake:
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
+    cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    local: LocalTransfer | None = None
+    local_scale: float = 1.0
 
     def run(self) -> Generator[Progress, None, BakeResult]:
         """All stages in order."""
@@ -138,6 +143,10 @@ class _Bake:
         if visibility is not None:
             with self.timer.stage("glossy"):
                 glossy = yield from self._glossy(receivers, transfer, visibility, gathered)
+        local = None
+        if self.settings.local_light:
+            with self.timer.stage("local"):
+                local = yield from self._local(gathered)
         # What later stages do not read is large: rays' hits, visibility, the operator.
         gathered, bounced, visibility = _numbers_of(gathered), _numbers_of(bounced), None
         transfer = self._by_point(receivers, transfer)
@@ -148,6 +157,7 @@ class _Bake:
             yield self._progress("encode", 0.0)
             buried = self._find_buried(transfer)
             signals = self._signals(transfer, glossy, subsurface)
+            self._join_local(signals, local)
             self._choose_highlights(glossy, signals)
             glossy = None
             self._fill_buried(buried, signals)
@@ -344,6 +354,42 @@ class _Bake:
         self._save("subsurface", *packed_bodies(bodies))
         return bodies
 
+    def _local(self, gathered: Gather | None) -> Generator[Progress, None, LocalTransfer]:
+        """The transfer of local lights, by point."""
+        stored = self._load("local")
+        if stored is not None:
+            return unpacked_local(*stored)
+        albedo = None
+        if gathered is not None:
+            albedo = self.albedo[gathered.receivers.key % len(self.scene.points)][:, :self.plan.needs.channels]
+        local = yield from self._follow("local", local_transfer(
+            self.tracer, self.scene, gathered, albedo, self.keys, self.regions, self.settings, self.folder))
+        self._save("local", *packed_local(local))
+        return local
+
+    def _join_local(self, signals: dict[str, NDArray[np.float32]], local: LocalTransfer | None) -> None:
+        """Put the columns of local lights behind those of distant light, or in their place where that is not baked.
+
+        One encoding holds both. Distant light is radiance, a cloud's light 1 W/sr from metres away: numbers of very
+        different size, so that a scale makes both parts weigh the same, taken out of the bases again.
+        """
+        self.local = local
+        if local is None:
+            return
+        share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
+        distant = sum(float(np.sum(np.square(s, dtype=np.float64))) for s in signals.values())
+        near = float(np.sum(np.square(local.transfer[self.keys], dtype=np.float64)))
+        both = self.settings.distant_light and distant > 0.0 and near > 0.0
+        self.local_scale = np.sqrt(distant / near) if both else 1.0
+        for target in self.targets:
+            before = signals[target.name]
+            columns = before.shape[2] if self.settings.distant_light else 0
+            joined = np.zeros((*before.shape[:2], columns + local.transfer.shape[1], before.shape[3]), np.float32)
+            joined[:, :, :columns] = before[:, :, :columns]
+            dimmed = share[self.scene.material[target.points], None, None] * np.float32(self.local_scale)
+            joined[:, 0, columns:] = local.transfer[target.points] * dimmed
+            signals[target.name] = joined
+
     def _signals(self, transfer: NDArray[np.float32], glossy: GlossyRows | None,
                  subsurface: list[BodyLight]) -> dict[str, NDArray[np.float32]]:
         """Each target's M_p (p, rows, columns, channels): the diffuse row, then those of the view direction."""
@@ -462,8 +508,12 @@ class _Bake:
     def _encode_one(self, target: SceneObject, signal: NDArray[np.float32], settings: EncoderSettings,
                     metric: NDArray[np.float64] | None, state: _EncodeState) -> Encoding:
         """One target's encoding, made coherent where that is asked for."""
-        encoding = encode(signal, settings, metric, state.report)
-        if self.settings.coherence > 0.0:
+        if self.local is None:
+            encoding = encode(signal, settings, metric, state.report)
+        else:
+            zone = self.local.zone[target.points][~self.scene.loose[target.points]]
+            encoding, self.cluster_zone[target.name] = encode_groups(signal, zone, settings, metric, state.report)
+        if self.settings.coherence > 0.0 and self.local is None:  # it would move points out of their zones
             place = np.cumsum(~self.scene.loose[target.points]) - 1
             triangles = place[self.scene.triangles[target.triangles] - target.points.start]
             encoding, self.coherence[target.name] = make_coherent(
@@ -528,7 +578,8 @@ class _Bake:
             if len(inside):
                 place = np.cumsum(~self.scene.loose[target.points]) - 1
                 values = decoded(encodings[target.name], place[keys[inside] - target.points.start])
-                result[inside] = values.reshape(len(inside), *self.shapes[target.name])[:, rows]
+                values = values.reshape(len(inside), *self.shapes[target.name])
+                result[inside] = values[:, rows, :shape[1]]  # without the columns of local lights
         return result
 
     def _result(self, gathered: Gather | None, bounced: Interreflection | None, transfer: NDArray[np.float32],
@@ -546,10 +597,16 @@ class _Bake:
         objects = {
             target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],
                                           self.surfaces.functions_of_object(self.scene, target), self.settings, report,
-                                          self.digests.get(target.name, ""))
+                                          self.digests.get(target.name, ""), self._local_columns(target.name))
             for target in self.targets
         }
         return BakeResult(objects, report)
+
+    def _local_columns(self, name: str) -> LocalColumns | None:
+        """What a container tells of its local lights."""
+        if self.local is None:
+            return None
+        return LocalColumns(self.local.cloud, self.cluster_zone[name], self.local_scale)
 
 
 @dataclass(frozen=True)

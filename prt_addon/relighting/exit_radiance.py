@@ -120,20 +120,22 @@ def diffuse_radiance(baked: Baked, light: ArrayLike) -> FloatArray:
     return exit_radiance(baked.cluster, baked.weights, constants)[:, 0] * baked.albedo
 
 
-def view_radiance(baked: Baked, light: ArrayLike, views: ArrayLike) -> FloatArray:
+def view_radiance(baked: Baked, light: ArrayLike, views: ArrayLike, direct: FloatArray | None = None) -> FloatArray:
     """Radiance (p, 3) float32 that leaves every receiver towards its view, diffuse transfer too.
 
     light: as for `cluster_constants`; views: (p, 3) directions in world space when baked, away from the surface, of any
-    length above zero. Views from behind the surface: see `hemisphere_values`. Raises ValueError where shapes do not
-    fit.
+    length above zero; direct: (p, rows, 3) direct light of lamps to add, None for none. Views from behind the surface:
+    see `hemisphere_values`. Raises ValueError where shapes do not fit.
     """
     views = np.asarray(views, np.float64)
     if views.shape != baked.normals.shape:
         raise ValueError(f"one view for each of {len(baked.normals)} receivers is needed, not {views.shape}")
-    if not baked.functions:
-        return diffuse_radiance(baked, light)
     constants = cluster_constants(baked.bases, light, baked.cluster_zone)
     rows = exit_radiance(baked.cluster, baked.weights, constants)
+    if direct is not None:
+        rows = rows + direct
+    if not baked.functions:
+        return rows[:, 0] * baked.albedo
     values = hemisphere_values(baked.functions, local_views(views, baked.normals, baked.tangents))
     return combine_rows(rows, baked.albedo, values)
 
