@@ -35,6 +35,9 @@ BLOCK_NUMBERS = 8_000_000
 MOST_RECEIVERS = 4096
 # Receivers that stand for all in the lower bound of a difference, beside each light's brightest: brightest of parts.
 PARTS = 4
+SEARCHED = 8192
+# Lights compared with another one at once: their rows fit the cache.
+TOGETHER = 16
 # Responses of a cluster's lights that lie this far below the largest count as this large in the harmonic mean.
 HARMONIC_FLOOR = 0.25
 
@@ -171,11 +174,23 @@ def _harmonic_scale(block: Single, labels: NDArray[np.integer], starts: NDArray[
 
 def _lengths(values: NDArray[np.floating]) -> NDArray[np.floating]:
     """Euclidean lengths over the last axis, without leaving single precision's range."""
-    if values.shape[-1] == 1:
+    count = values.shape[-1]
+    if count == 1:
         return np.abs(values[..., 0])
-    largest = np.abs(values).max(axis=-1, keepdims=True)
-    scaled = np.divide(values, largest, out=np.zeros_like(values), where=largest > 0.0)
-    return largest[..., 0] * np.sqrt(np.vecdot(scaled, scaled))  # small
+    values = values.astype(_squares_type(values), copy=False)
+    if count <= 4:
+        squared = np.square(values[..., 0])
+        for index in range(1, count):
+            squared += np.square(values[..., index])
+    else:
+        squared = np.vecdot(values, values)  # small
+    return np.sqrt(squared, out=squared).astype(np.float32)
+
+
+def _squares_type(values: NDArray[np.floating]) -> type[np.floating]:
+    """float32 where squares of all values that matter beside the largest are within its range, else float64."""
+    largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
+    return np.float32 if largest == 0.0 or 1e-12 < largest < 1e15 else np.float64
 
 
 def _delta(apart: NDArray[np.float64], w2: float, differences: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -199,11 +214,12 @@ def _blocks(responses: Responses, most: int = 2 ** 62) -> Iterator[tuple[slice, 
 
 def _lower_bound(responses: Responses) -> Single:
     """A lower bound (l, l) of the largest difference of two lights' responses: the difference at the receivers that
-    are brightest for one of the two in each of PARTS runs of receivers."""
+    are brightest for one of the two in each of PARTS runs of receivers, of SEARCHED receivers of all."""
     lights = responses.shape[1]
     bound = np.zeros((lights, lights), np.float32)
-    runs = -(-responses.shape[0] // PARTS)
-    for _, block in _blocks(responses, max(runs, 1)):
+    step = max(-(-responses.shape[0] // SEARCHED), 1)
+    searched = _EveryFew(responses, step)
+    for _, block in _blocks(searched, max(-(-searched.shape[0] // PARTS), 1)):
         brightest = _lengths(block).argmax(axis=0)
         for start in range(0, lights, 64):
             chosen = block[brightest[start:start + 64]]  # (64, lights, values), row j at light j's brightest receiver
@@ -213,31 +229,50 @@ def _lower_bound(responses: Responses) -> Single:
     return np.maximum(bound, bound.T)
 
 
+class _EveryFew:
+    """Every so many receivers of responses."""
+
+    def __init__(self, responses: Responses, step: int) -> None:
+        self.responses, self.step = responses, step
+        self.shape = (-(-responses.shape[0] // step), *responses.shape[1:])
+
+    def __getitem__(self, part: slice) -> NDArray[np.floating]:
+        return self.responses[part.start * self.step:part.stop * self.step:self.step]
+
+
 def _largest_differences(responses: Responses, first: Pairs, second: Pairs, kept: Pairs, apart: NDArray[np.float64],
                          w2: float) -> tuple[Pairs, Single]:
     """max_c ||X_j^c - X_k^c|| of the pairs that stay below 1, and which pairs these are. kept: numbers of pairs."""
     largest = np.zeros(len(kept), np.float32)
     for _, block in _blocks(responses, MOST_RECEIVERS):
-        by_light = np.ascontiguousarray(block.transpose(2, 1, 0))  # (values, lights, receivers)
+        if not len(kept):
+            break
+        used = np.union1d(first[kept], second[kept])
+        chosen = np.take(block, used, axis=1)
+        by_light = np.ascontiguousarray(chosen.transpose(2, 1, 0), _squares_type(chosen))  # (values, lights, receivers)
+        place = np.searchsorted(used, second[kept])
         lights, starts = np.unique(first[kept], return_index=True)
-        for light, start, end in zip(lights, starts, [*starts[1:], len(kept)], strict=True):
-            _compare(by_light, light, second[kept[start:end]], largest[start:end])
+        for light, start, end in zip(np.searchsorted(used, lights), starts, [*starts[1:], len(kept)], strict=True):
+            for some in range(start, end, TOGETHER):
+                part = slice(some, min(some + TOGETHER, end))
+                _compare(by_light, light, place[part], largest[part])
         near = _delta(apart[kept], w2, largest) < 1.0
         kept, largest = kept[near], largest[near]
     return kept, largest
 
 
 def _compare(by_light: Single, light: int, others: Pairs, largest: Single) -> None:
-    """Raise largest (m,), in place, to the differences between a light and others (m,) at a block's receivers."""
+    """Raise largest (m,), in place, to the differences between a light and others (m,) at a block's receivers.
+    by_light: (values, lights, receivers)."""
     if len(by_light) == 1:
         difference = np.take(by_light[0], others, axis=0)
         difference -= by_light[0, light]
         np.maximum(largest, difference.max(axis=1), out=largest)
         np.maximum(largest, -difference.min(axis=1), out=largest)
         return
-    squared = np.zeros((len(others), by_light.shape[2]), np.float64)
+    squared = np.zeros((len(others), by_light.shape[2]), by_light.dtype)
     for values in by_light:
         difference = np.take(values, others, axis=0)
         difference -= values[light]
-        squared += np.square(difference, dtype=np.float64)
-    np.maximum(largest, np.sqrt(squared.max(axis=1)), out=largest)
+        squared += np.square(difference, out=difference)
+    np.maximum(largest, np.sqrt(squared.max(axis=1)).astype(np.float32), out=largest)
