@@ -26,7 +26,7 @@ from ..prt_addon.errors import PRTError
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
-from .scene_lamps import SceneLamps
+from .scene_lamps import SceneLamps, lamps_signature
 
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
@@ -200,7 +200,7 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     now, baked = time.perf_counter(), {name: shown.baked for name, shown in _live.shown.items()}
     lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time)
     _live.lamps_time = now
-    signature = tuple(lamp.signature for lamp in lamps)
+    signature = lamps_signature(lamps)
     if signature != _live.lamps_signature or any(
             shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature = signature

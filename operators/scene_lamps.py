@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
 import bpy
@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.lighting.local_lights import LocalLight
-from ..prt_addon.relighting.direct_light import DirectLight
-from ..prt_addon.relighting.lamp_light import AT_ONCE, CloudLight, LampLight
+from ..prt_addon.relighting.lamp_light import AT_ONCE, CloudLight, DirectLight, LampLight
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
@@ -72,7 +71,8 @@ class SceneLamps:
 
     def cloud_light(self, baked: BakedTransfer) -> NDArray[np.float32] | None:
         """The lamps' light (zones, columns, 3) in the cloud of a bake; None without a cloud."""
-        return self._lit[_cloud_key(baked)].values if baked.cloud is not None else None
+        found = self._lit.get(_cloud_key(baked)) if baked.cloud is not None else None
+        return None if found is None else found.values
 
     def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight]) -> NDArray[np.float32] | None:
         """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud."""
@@ -81,6 +81,12 @@ class SceneLamps:
         if name not in self._direct:
             self._direct[name] = DirectLight(self._tracer, baked)
         return self._direct[name].of(lamps)
+
+
+def lamps_signature(lamps: Sequence[LocalLight]) -> Hashable:
+    """Changes when a lamp does."""
+    return tuple((lamp.key, lamp.kind, lamp.matrix.tobytes(), lamp.power.tobytes(), lamp.radius, lamp.soft_falloff,
+                  lamp.spot_angle, lamp.spot_blend, lamp.shape, lamp.size, lamp.spread, lamp.shadow) for lamp in lamps)
 
 
 def _cloud_key(baked: BakedTransfer) -> str:

@@ -591,6 +591,9 @@ class _Bake:
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
+        if self.local is not None:
+            report["local"] = self.local.facts
+            report["scene"]["warnings"] += self.local.facts["warnings"]
         if self.filled:
             note = f"{self.filled} receivers inside other objects take their neighbours' light"
             report["scene"]["warnings"].append(note)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The indirect light of lamps, in the columns of a baked light cloud (Kristensen et al. 2005, section 6).
+"""The light of lamps on a bake: bounced in the columns of its light cloud (Kristensen et al. 2005, section 6), direct
+by shadow rays.
 
-Lamps with a surface shine from a few points of it, each with the lamp's emission in spherical harmonics up to the order
-that the cloud was baked with; their direct light is exact and not made here (direct_light.py).
+Lamps with a surface shine into the cloud from a few points of it, each with the lamp's emission in spherical harmonics
+up to the order that the cloud was baked with.
 """
 
 from __future__ import annotations
@@ -19,9 +20,13 @@ from ..lighting.light_fading import FADE_SECONDS, FadingWeights
 from ..lighting.light_interpolation import NEAREST, CloudInterpolator
 from ..lighting.local_lights import LocalLight
 from ..tracing.tracer import Tracer
+from .direct_light import LitReceivers, direct_local_light
+from .exit_radiance import Baked
 
 # Points of a lamp with a surface, at most: its indirect light hardly tells more apart.
 MOST_POINTS = 16
+# Shadow rays from a receiver to a lamp that throws soft shadows.
+SHADOW_SAMPLES = 16
 # Seconds that count as a leap: nothing fades.
 AT_ONCE = 1e9
 
@@ -83,3 +88,21 @@ class LampLight:
 def _named(names: Sequence[str], chosen: NDArray[np.bool_]) -> tuple[str, ...]:
     """The names of the chosen ones, each once."""
     return tuple(dict.fromkeys(name for name, taken in zip(names, chosen, strict=True) if taken))
+
+
+class DirectLight:
+    """Direct light of lamps on one bake's receivers.
+
+    tracer: of everything that casts shadows.
+    """
+
+    def __init__(self, tracer: Tracer, baked: Baked, samples: int = SHADOW_SAMPLES) -> None:
+        self._tracer, self._samples = tracer, samples
+        self._receivers = LitReceivers.of_points(tracer, baked.positions, baked.normals)
+        self._rows = baked.bases.shape[2]
+
+    def of(self, lamps: Sequence[LocalLight]) -> NDArray[np.float32]:
+        """(points, rows, 3) float32: what they add to the exit radiance, in row 0 for unit albedo."""
+        result = np.zeros((len(self._receivers), self._rows, 3), np.float32)
+        result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+        return result

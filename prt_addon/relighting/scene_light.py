@@ -25,7 +25,8 @@ def joined_light(basis: LightingBasis, distant: NDArray[np.floating] | None,
     """Light (columns, 3), or (zones, columns, 3) where a light cloud takes part, float32.
 
     distant: (n, 3) coefficients, at least basis.distant of them (higher orders are left out), or None for none; local:
-    (zones, basis.cloud, 3) weights of the cloud's lights, or None for none. Raises ValueError where there are too few coefficients.
+    (zones, basis.cloud, 3) weights of the cloud's lights, or None for none. Raises ValueError where there are too few
+    coefficients.
     """
     first = np.zeros((basis.distant, 3), np.float32)
     if distant is not None and basis.distant:

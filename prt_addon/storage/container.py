@@ -157,7 +157,8 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
     """The container from stored arrays, checked against the header.
 
     geometry: albedo, positions, normals (p, 3) and triangles (t, 3); tangents (p, 3) where rows need them; flat_cloud:
-    of `flatten_cloud` where columns need it. Raises StorageError where a shape, an index or a value can't be right, so that broken data is never drawn.
+    of `flatten_cloud` where columns need it. Raises StorageError where a shape, an index or a value can't be right, so
+    that broken data is never drawn.
     """
     clusters, representatives, rows, columns, channels = check_header(header, subject)["shape"]
     points, vectors = len(cluster), representatives - 1
