@@ -25,7 +25,7 @@ import numpy as np
 from common import drain, print_table
 from numpy.typing import NDArray
 
-from prt_addon.baking.recipe import _Bake
+from prt_addon.baking.recipe import _Bake, transport_settings
 from prt_addon.baking.settings import BakeSettings, make_settings
 from prt_addon.blender.read_scene import read_objects
 from prt_addon.lighting.light_cloud import box_matrix
@@ -56,6 +56,7 @@ class Kept:
     transfer: NDArray[np.float32]
     report: dict
     seconds: float
+    visible: NDArray[np.int64]  # receivers of the object that do not lie inside bodies
 
 
 class _KeepingBake(_Bake):
@@ -67,18 +68,19 @@ class _KeepingBake(_Bake):
         return self.kept_local
 
 
-def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSettings) -> Kept:
+def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSettings, spacing: float = 0.0) -> Kept:
     """Bake the object's vertices as they are."""
-    scene = SceneMesh.assemble(read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name], []), 0.0)
+    scene = SceneMesh.assemble(read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name], []), spacing)
     started = time.perf_counter()
-    bake = _KeepingBake(scene, settings, None, None, {}, np.array([box_matrix(*box)]))
+    bake = _KeepingBake(scene, transport_settings(settings), None, None, {}, np.array([box_matrix(*box)]))
     result = drain(bake.run())
     seconds = time.perf_counter() - started
     point = bake.kept_gather.receivers.key % len(scene.points)
     solver = LightSolver(bake.tracer, scene, bake.kept_gather, bake.albedo[point][:, :bake.plan.needs.channels], 1e-4, -1)
     place = next(o.points for o in scene.objects if o.is_target)
+    visible = bake.open_keys[(bake.open_keys >= place.start) & (bake.open_keys < place.stop)] - place.start
     return Kept(next(iter(result.objects.values())), solver, scene, bake.kept_local.transfer[place], result.report,
-                seconds)
+                seconds, visible)
 
 
 def held_back(tracer: Tracer, box: NDArray[np.float64], count: int, clearance: float) -> NDArray[np.float64]:
@@ -131,9 +133,8 @@ def run(name: str, arguments: argparse.Namespace) -> list:
     sums = np.zeros((4, 2))
     for position in places:
         source.location = position
-        solved, cloud, drawn = ours(kept, lamp, position)
-        count = len(solved)
-        first, second = (vertex_radiance(thing, {"INDIRECT"}, seed)[:count] for seed in (0, 1))
+        solved, cloud, drawn = (light[kept.visible] for light in ours(kept, lamp, position))
+        first, second = (vertex_radiance(thing, {"INDIRECT"}, seed)[kept.visible] for seed in (0, 1))
         power = np.sum(first * second)
         sums += [[np.sum((solved - first) * (solved - second)), power], [np.sum((cloud - solved) ** 2), power],
                  [np.sum((drawn - cloud) ** 2), power], [np.sum((drawn - first) * (drawn - second)), power]]

@@ -92,12 +92,18 @@ def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = Non
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
     scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
-    if not settings.distant_light:
-        # A white sky of one coefficient still tells what is buried, dark, or brighter than it can be.
-        settings = replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS),
-                           error_receivers=0, glossy_rows=0, subsurface=False)
+    settings = transport_settings(settings)
     regions = np.empty((0, 4, 4)) if regions is None else regions
     return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions).run())
+
+
+def transport_settings(settings: BakeSettings) -> BakeSettings:
+    """What the stages of distant light are asked for where only local light is baked: a white sky of one coefficient
+    still tells what is buried, dark, or brighter than it can be."""
+    if settings.distant_light:
+        return settings
+    return replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS), error_receivers=0,
+                   glossy_rows=0, subsurface=False)
 
 
 @dataclass
