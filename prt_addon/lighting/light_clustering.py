@@ -167,8 +167,8 @@ def _harmonic_scale(block: Single, labels: NDArray[np.integer], starts: NDArray[
     lengths = _lengths(block.reshape(*block.shape[:2], -1, channels).swapaxes(2, 3))
     least = np.float32(HARMONIC_FLOOR) * np.maximum.reduceat(lengths, starts, axis=1)
     lengths = np.maximum(lengths, least[:, labels])
-    reciprocal = np.add.reduceat(np.divide(1.0, lengths, out=np.zeros_like(lengths), where=lengths > 0.0), starts, axis=1)
-    total = reciprocal * np.add.reduceat(lengths, starts, axis=1)
+    inverse = np.divide(1.0, lengths, out=np.zeros_like(lengths), where=lengths > 0.0)
+    total = np.add.reduceat(inverse, starts, axis=1) * np.add.reduceat(lengths, starts, axis=1)
     return np.divide(members ** 2, total, out=np.ones_like(total), where=total > 0.0)
 
 

@@ -27,6 +27,9 @@ EXPONENT = 4
 # Visible lights around a lamp are weighed by 1 - d^2/r^2 and r grows until the sum is this share of `nearest`: over a
 # ball evenly filled with lights the mean of that weight is 2/5.
 SHARE = 0.4
+# Where few lights are visible, r grows until that sum is this share of what it is over all of them: as little as
+# leaves one of two lights a weight wherever a lamp is between them.
+FEW = 0.75
 # Nearest lights per wanted one that are looked at: if a wall hides half of them, enough are left.
 CANDIDATES = 2
 # Variance of the lights' offsets, in squares of r, that counts as no extent at all: 1 % of r across. In a direction in
@@ -79,8 +82,9 @@ class CloudWeights:
         emission = np.asarray(emission, np.float64)
         if emission.ndim != 3 or len(emission) != lamps:
             raise ValueError(f"emission of shape {emission.shape} for {lamps} lamps")
-        total = multiply(self.weights.reshape(lamps, -1).T, emission.reshape(lamps, -1))
-        return total.reshape(zones, -1, emission.shape[2]).astype(np.float32)
+        _, functions, channels = emission.shape
+        total = multiply(self.weights.reshape(lamps, zones * lights).T, emission.reshape(lamps, functions * channels))
+        return total.reshape(zones, lights * functions, channels).astype(np.float32)
 
 
 class CloudInterpolator:
@@ -234,13 +238,13 @@ def _linear(offset: NDArray[np.float64], squared: NDArray[np.float64], limit: ND
 def _radius_squared(squared: NDArray[np.float64], share: NDArray[np.float64], fade: NDArray[np.float64],
                     nearest: int) -> NDArray[np.float64]:
     """The kernel's r squared (n, z): the sum over lights of fade (1 - d^2/r^2), where positive, is SHARE * nearest, or
-    half of what it is over all candidates where that is less (small clouds, many lights hidden).
+    FEW of what it is over all candidates where that is less (small clouds, many lights hidden).
 
     So r follows visibility and distances without jumps, where the distance to the m-th visible light would not. Over
     the i nearest lights the sum is F_i - S_i / r^2, largest over all i for those within r: each i gives an r and the
     least of them is the solution.
     """
-    wanted = np.minimum(SHARE * nearest, 0.5 * np.sum(fade * share, axis=-1, keepdims=True))
+    wanted = np.minimum(SHARE * nearest, FEW * np.sum(fade * share, axis=-1, keepdims=True))
     number, weighted = np.cumsum(fade, axis=-1), np.cumsum(fade * squared, axis=-1)
     excess = number - wanted
     found = np.where(excess > 0.0, weighted / np.where(excess > 0.0, excess, 1.0), np.inf).min(axis=-1, initial=np.inf)
