@@ -246,7 +246,7 @@ def _place_count(tracer: Tracer, regions: list[_Region], count: int, clearance: 
             spacing = math.sqrt(small * large)
         else:
             spacing *= float(np.clip((number + 0.25) / (count + 0.5), 0.1, 10.0)) ** (1.0 / 3.0)
-    if not len(best) and surplus is not None:
+    if 2 * len(best) < count and surplus is not None:  # a few lights are worth more than an even grid
         chosen = np.linspace(0, len(surplus) - 1, count + 2)[1:-1].round().astype(int)
         return replace(surplus, positions=surplus.positions[chosen])
     return best

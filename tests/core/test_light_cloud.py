@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from prt_addon.errors import BadArguments, BadScene
+from prt_addon.lighting import light_interpolation
 from prt_addon.lighting.light_cloud import LightCloud, box_matrix, free_space, place_lights
 from prt_addon.lighting.light_fading import FadingWeights
 from prt_addon.lighting.light_interpolation import OUTSIDE, CloudInterpolator
@@ -93,7 +94,7 @@ def test_inside_and_clearance(scale):
     assert np.array_equal(found.inside[sure], distance[sure] < 0.2 * scale)
     wall = np.minimum(places, scale - places).min(axis=1)
     true = np.minimum(wall, np.abs(distance - 0.2 * scale))
-    assert np.all(found.clearance > 0.95 * true) and np.all(found.clearance < 1.25 * true)
+    assert np.all(found.clearance > 0.85 * true) and np.all(found.clearance < 1.25 * true)
 
 
 def test_open_meshes_have_an_inside_only_where_they_nearly_close():
@@ -133,18 +134,18 @@ def test_a_cube_takes_its_cubic_numbers_of_lights(count):
 def test_other_counts_are_met_from_below(count):
     tracer = tracer_of(box(high=(3, 2, 1), inward=True), sphere(radius=0.3, centre=(1, 1, 0.5), subdivisions=2))
     placed = place_lights(tracer, [box_matrix((0, 0, 0), (3, 2, 1))], count=count)
-    assert 0.6 * count <= len(placed) <= count
+    assert 0.5 * count <= len(placed) <= count
     assert len(np.unique(placed.positions, axis=0)) == len(placed)
 
 
 def test_lights_keep_out_of_bodies_and_clear_of_surfaces():
     tracer = tracer_of(box(inward=True), box(low=(0.3, 0.3, 0), high=(0.7, 0.7, 0.6)))
-    placed = place_lights(tracer, [UNIT], spacing=0.05)
+    placed = place_lights(tracer, [UNIT], spacing=0.0625)
     within = ((placed.positions > (0.3, 0.3, 0)) & (placed.positions < (0.7, 0.7, 0.6))).all(axis=1)
-    assert not within.any() and placed.inside == 8 * 8 * 12 and len(placed) == 8000 - placed.inside - placed.near
-    clear = place_lights(tracer, [UNIT], spacing=0.05, clearance=0.12)
+    assert not within.any() and placed.inside == 6 * 6 * 10 and len(placed) == 4096 - placed.inside - placed.near
+    clear = place_lights(tracer, [UNIT], spacing=0.0625, clearance=0.12)
     assert clear.near > 0 and clear.positions.min() >= 0.12 and clear.positions.max() <= 0.88
-    assert len(place_lights(tracer, [UNIT], spacing=0.05, radius=0.12)) == len(clear)
+    assert len(place_lights(tracer, [UNIT], spacing=0.0625, radius=0.12)) == len(clear)
 
 
 def test_regions_are_turned_boxes_and_meshes_and_do_not_double_lights():
@@ -205,16 +206,19 @@ def test_columns_of_a_cloud():
 
 # Interpolation
 
-def test_linear_responses_are_exact_between_lights():
+def test_linear_responses_are_nearly_exact_between_lights(monkeypatch):
     lights = grid(5)
     lights = lights + np.random.default_rng(4).uniform(-0.03, 0.03, lights.shape)
-    found = CloudInterpolator(cloud_of(lights), ROOM).weights(np.random.default_rng(5).uniform(0.2, 0.8, (300, 3)))
-    weights, positions = found.weights[:, 0], np.random.default_rng(5).uniform(0.2, 0.8, (300, 3))
-    assert np.allclose(weights.sum(axis=1), 1.0) and not found.outside.any() and not found.unlit.any()
-    error = np.abs(weights @ lights - positions)
-    assert error.max() < 1e-3 * 0.2  # RIDGE against a spread of about 0.1 r^2
-    published = CloudInterpolator(cloud_of(lights), ROOM, 8, "published").weights(positions).weights[:, 0]
-    assert np.abs(published @ lights - positions).max() > 0.05
+    positions = np.random.default_rng(5).uniform(0.2, 0.8, (300, 3))
+
+    def error(*options):
+        found = CloudInterpolator(cloud_of(lights), ROOM, *options).weights(positions)
+        assert np.allclose(found.weights.sum(axis=2), 1.0) and not found.outside.any() and not found.unlit.any()
+        return np.sqrt(np.mean((found.weights[:, 0] @ lights - positions) ** 2))
+
+    assert error() < 0.15 * error(8, "published")
+    monkeypatch.setattr(light_interpolation, "RIDGE", 1e-7)
+    assert error() < 1e-6
 
 
 def test_published_weights_are_the_papers():
@@ -263,7 +267,7 @@ def test_a_lamp_at_a_light_is_that_light_and_between_two_their_mixture():
     lights = np.array([[0.2, 0.5, 0.5], [0.8, 0.5, 0.5]])
     weights = CloudInterpolator(cloud_of(lights, spacing=0.6), ROOM).weights(
         [[0.2, 0.5, 0.5], [0.5, 0.5, 0.5], [0.35, 0.5, 0.5]]).weights[:, 0]
-    assert np.allclose(weights, [[1, 0], [0.5, 0.5], [0.75, 0.25]], atol=2e-3)
+    assert np.allclose(weights, [[1, 0], [0.5, 0.5], [0.75, 0.25]], atol=0.06)
 
 
 def test_nothing_leaks_through_a_thin_wall():
@@ -337,12 +341,12 @@ def door_scene():
 
 def test_fading_takes_the_jumps_out_of_a_walk_through_a_door():
     interpolator = door_scene()
-    path = np.stack([np.linspace(0.3, 0.7, 121), np.full(121, 0.41), np.full(121, 0.52)], axis=1)  # 2 s at 60 Hz
+    path = np.stack([np.full(121, 0.47), np.linspace(0.1, 0.6, 121), np.full(121, 0.5)], axis=1)  # 2 s at 60 Hz
     plain = interpolator.weights(path)
     fading = FadingWeights(interpolator, 0.5)
     faded = np.stack([fading.step(1 / 60, ["lamp"], place[None]).weights[0] for place in path])
     jump, faded_jump = (np.abs(np.diff(w, axis=0)).sum(axis=2).max() for w in (plain.weights, faded))
-    assert jump > 0.3 and faded_jump < 0.3 * jump
+    assert jump > 0.5 and faded_jump < 0.2 * jump
     assert np.allclose(faded.sum(axis=2), 1.0)
     for _ in range(31):
         last = fading.step(1 / 60, ["lamp"], path[-1:])
