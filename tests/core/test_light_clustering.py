@@ -38,9 +38,6 @@ def problem(lights, receivers, values, seed=0):
 
 
 def plain_distances(positions, responses, w1, w2):
-    lengths = [np.sqrt(((responses[:, j, None].astype(float) - responses[:, None, j]) ** 2).sum(axis=-1))
-               for j in range(0)]
-    assert not lengths
     largest = np.zeros((len(positions),) * 2)
     for receiver in responses.astype(float):
         largest = np.maximum(largest, squareform(pdist(receiver)))
@@ -142,7 +139,7 @@ def test_means_of_positive_responses_are_the_plain_ones(monkeypatch):
     responses = np.random.default_rng(1).uniform(0.5, 1.9, (30, 6, 3)).astype(np.float32)
     for mode, mean in (("harmonic", hmean), ("arithmetic", np.mean)):
         found = merged_response(responses, LABELS, mode, channels=3)
-        expected = np.stack([mean(responses[:, LABELS == c], axis=1) for c in range(3)], axis=1)
+        expected = np.stack([mean(responses[:, c == LABELS], axis=1) for c in range(3)], axis=1)
         assert found.dtype == np.float32 and np.allclose(found, expected, rtol=1e-5)
 
 
