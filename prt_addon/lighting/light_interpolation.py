@@ -20,7 +20,9 @@ from .light_visibility import visible_between
 
 Interpolation = Literal["linear", "published"]
 
-# Lights of a zone, on the average, that a lamp is interpolated between.
+# Lights of a zone, on the average, that a lamp is interpolated between. In a box of 216 lights 8 / 12 / 16 of them err
+# by 2.4 / 1.9 / 1.7 % between the lights and 10.7 / 10.7 / 10.9 % near walls; as published 5.3 / 3.3 / 2.4 and 11.7 /
+# 11.5 / 12.1 % (benchmarks/light_cloud.py).
 NEAREST = 12
 # Exponent of the paper's kernel, (1 - d/r)^4.
 EXPONENT = 4
@@ -210,8 +212,8 @@ def _published(distance: NDArray[np.float64], found: NDArray[np.bool_], fade: ND
 
 def _linear(offset: NDArray[np.float64], squared: NDArray[np.float64], limit: NDArray[np.float64],
             fade: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights (n, z, k) that nearly reproduce linear functions of position, and their sum (n, z), 1, or less where the last
-    lights fade. squared: (n, z, k) distances; limit: (n, z), both squared.
+    """Weights (n, z, k) that nearly reproduce linear functions of position, and their sum (n, z), 1, or less where the
+    last lights fade. squared: (n, z, k) distances; limit: (n, z), both squared.
 
     Moving least squares of degree 1 (Lancaster and Salkauskas 1981): the plane fitted to the lights' responses under
     the kernel's weights k_i, read at the lamp: k_i (1 - c_i . C^-1 m), m the weighted mean of the offsets o_i,
