@@ -4,8 +4,8 @@
     python benchmarks/light_cloud.py [clustering] [error] [merging] [moves]
 
 The field is the indirect light in a box with walls of albedo 0.5 (Cornell's without blocks): walls in patches, the
-light of an isotropic point on each in closed form (its solid angle), all further bounces by a direct solution. Errors are
-relative RMS over the patches, the mean and the largest over lamps held back: `inside`, between the lights of a cloud,
+light of an isotropic point on each in closed form (its solid angle), all further bounces by a direct solution. Errors
+are relative RMS over the patches, the mean and the largest over lamps held back: `inside`, between the lights of a cloud,
 and `near walls`, beyond its outermost ones, 2 cm from a wall of 1 m at least.
 """
 
