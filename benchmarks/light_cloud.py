@@ -5,8 +5,8 @@
 
 The field is the indirect light in a box with walls of albedo 0.5 (Cornell's without blocks): walls in patches, the
 light of an isotropic point on each in closed form (its solid angle), all further bounces by a direct solution. Errors
-are relative RMS over the patches, the mean and the largest over lamps held back: `inside`, between the lights of a cloud,
-and `near walls`, beyond its outermost ones, 2 cm from a wall of 1 m at least.
+are relative RMS over the patches, the mean and the largest over lamps held back: `inside`, between the lights of a
+cloud, and `near walls`, beyond its outermost ones, 2 cm from a wall of 1 m at least.
 """
 
 from __future__ import annotations
