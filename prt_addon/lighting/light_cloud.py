@@ -246,8 +246,8 @@ def _place_count(tracer: Tracer, regions: list[_Region], count: int, clearance: 
             spacing = math.sqrt(small * large)
         else:
             spacing *= float(np.clip((number + 0.25) / (count + 0.5), 0.1, 10.0)) ** (1.0 / 3.0)
-    if not len(best) and surplus is not None:
-        chosen = np.linspace(0, len(surplus) - 1, count + 2)[1:-1].round().astype(int)
+    if 2 * len(best) < count and surplus is not None:  # a few lights are worth more than an even grid
+        chosen = (2 * np.arange(count) + 1) * len(surplus) // (2 * count)
         return replace(surplus, positions=surplus.positions[chosen])
     return best
 

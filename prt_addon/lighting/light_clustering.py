@@ -26,7 +26,8 @@ Visibility = Callable[[Pairs, Pairs], NDArray[np.bool_]]
 # delta of two clusters, so one such pair keeps them apart whatever it says.
 FAR = 2.0
 # Default weights: lights farther apart than this fraction of the scene's size never merge, nor do lights whose
-# responses differ by more than this fraction of the largest response anywhere.
+# responses differ by more than this fraction of the largest response anywhere. In a box of 216 lights and 8 zones
+# 0.02 / 0.05 / 0.1 leave 80 / 44 / 27 lights and 2.5 / 3.8 / 7.6 % error, 1.9 % without (benchmarks/light_cloud.py).
 FARTHEST = 0.5
 LARGEST_DIFFERENCE = 0.05
 # Numbers of responses held at once beyond what the caller holds (32 MB), and receivers whose differences stay in
@@ -167,8 +168,8 @@ def _harmonic_scale(block: Single, labels: NDArray[np.integer], starts: NDArray[
     lengths = _lengths(block.reshape(*block.shape[:2], -1, channels).swapaxes(2, 3))
     least = np.float32(HARMONIC_FLOOR) * np.maximum.reduceat(lengths, starts, axis=1)
     lengths = np.maximum(lengths, least[:, labels])
-    reciprocal = np.add.reduceat(np.divide(1.0, lengths, out=np.zeros_like(lengths), where=lengths > 0.0), starts, axis=1)
-    total = reciprocal * np.add.reduceat(lengths, starts, axis=1)
+    inverse = np.divide(1.0, lengths, out=np.zeros_like(lengths), where=lengths > 0.0)
+    total = np.add.reduceat(inverse, starts, axis=1) * np.add.reduceat(lengths, starts, axis=1)
     return np.divide(members ** 2, total, out=np.ones_like(total), where=total > 0.0)
 
 

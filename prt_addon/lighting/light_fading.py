@@ -37,7 +37,7 @@ class FadingWeights:
         lights = len(self.interpolator.cloud.positions)
         unknown = np.full(lights + 1, np.nan, np.float32)  # the last one stands for no light
         before = np.stack([self._fades.get(lamp, unknown) for lamp in lamps]) if len(lamps) else unknown[None, :][:0]
-        flat = near.index.reshape(len(before), -1)
+        flat = near.index.reshape(len(before), near.index.shape[1] * near.index.shape[2])
         target = near.visible.reshape(flat.shape).astype(np.float32)
         known = np.take_along_axis(before, flat, axis=1)
         most = np.float32(max(seconds, 0.0) / self.fade_seconds if self.fade_seconds > 0.0 else 1.0)

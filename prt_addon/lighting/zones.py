@@ -30,6 +30,10 @@ class Zones:
         return np.split(order, np.searchsorted(self.zone[order], np.arange(1, len(self))))
 
 
+# Members (m,), low and high corner (3,) of a cell.
+_Cell = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+
+
 def split_zones(positions: NDArray[np.floating], most_receivers: int, smallest_extent: float = 0.0) -> Zones:
     """Zones of receivers at positions (p, 3), metres.
 
@@ -59,7 +63,7 @@ def split_zones(positions: NDArray[np.floating], most_receivers: int, smallest_e
 
 
 def _halves(positions: NDArray[np.float64], members: NDArray[np.int64], low: NDArray[np.float64],
-            high: NDArray[np.float64]) -> list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] | None:
+            high: NDArray[np.float64]) -> list[_Cell] | None:
     """The halves of a box that hold receivers, lower one first; None where its receivers all lie in one place or the
     box is too thin for floating point to halve."""
     axis = int(np.argmax(high - low))
