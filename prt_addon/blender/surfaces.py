@@ -184,6 +184,7 @@ class _Inputs:
 
     def _metallic(self) -> Surface:
         """A Metallic BSDF: the metal of a Principled BSDF; of measured constants its reflectance at the normal."""
+        self._check_distribution()
         tint = (1.0, 1.0, 1.0)
         if self.node.fresnel_type == "PHYSICAL_CONDUCTOR":
             n, k = (self._numbers(self.node.inputs[name])[:3] for name in ("IOR", "Extinction"))
@@ -212,6 +213,7 @@ class _Inputs:
         Its anisotropy a gives widths alpha (1 - a) along the tangent and alpha / (1 - a) across it; a Principled's b
         alpha / s and alpha s with s = sqrt(1 - 0.9 b). So s = 1 - |a|, and the tangent turns by a quarter where a > 0.
         """
+        self._check_distribution()
         colour = self.colour("Color")
         edge = tuple(c / max(c + (1.0 - c) * EDGE_SHARE, 1e-6) for c in colour)
         if max(colour) < LEAST_REFLECTION:
@@ -226,6 +228,11 @@ class _Inputs:
         material = SurfaceMaterial(self.material.name, colour, self._share("Roughness"), 1.0, specular_level=0.0,
                                    specular_tint=edge, anisotropic=anisotropic, anisotropic_rotation=turn)
         return Surface(material, self._tangent() if anisotropic > 0.0 else None)
+
+    def _check_distribution(self) -> None:
+        if "GGX" not in self.node.distribution:
+            lobe = self.node.distribution.replace("_", "-").title()
+            self._warn(f"the {lobe} lobe of node {self.node.name} is baked as GGX of the same roughness")
 
     def _tangent(self) -> Tangent:
         node = source_of(self.node.inputs["Tangent"], self._groups)

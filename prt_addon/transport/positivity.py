@@ -16,7 +16,8 @@ u the response of the open surface to a white world, m the means of the function
 (so the flux that leaves stays the same for every light), and t the largest factor up to 1 with which no view sees less
 than black in a white world. Receivers that do not ring keep their matrix to the last bit. Of linear smoothings that
 were tried with the same bound (penalties on gradient and Laplacian, over sphere and hemisphere, as window's in
-basis.spherical_harmonics) none had a smaller error; under lights other than white negative radiance falls to a third.
+basis.spherical_harmonics) none was clearly better. Other lights than white have no such bound: at receivers that ring,
+the lowest radiance under half-domes or a sky with a broad sun shrinks to between a twentieth and three quarters.
 """
 
 from __future__ import annotations

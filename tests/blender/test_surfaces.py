@@ -229,6 +229,14 @@ def test_metallic_is_a_metal(scene: bpy.types.Scene) -> None:
     assert gold.base_colour == pytest.approx((0.944, 0.776, 0.373), abs=2e-3)
 
 
+def test_other_lobes_than_ggx_are_named(scene: bpy.types.Scene) -> None:
+    warnings: list[str] = []
+    read(one_node("ShaderNodeBsdfAnisotropic", distribution="ASHIKHMIN_SHIRLEY"), warnings)
+    assert len(warnings) == 1 and "Ashikhmin-Shirley" in warnings[0]
+    read(one_node("ShaderNodeBsdfAnisotropic", distribution="GGX"), warnings)
+    assert len(warnings) == 1
+
+
 @pytest.mark.parametrize(("build", "colour"), [
     (one_node("ShaderNodeBsdfGlass", {"Color": (0.3, 0.6, 0.9, 1)}), (0.3, 0.6, 0.9)),
     (one_node("ShaderNodeBsdfRefraction", {"Color": (0.3, 0.6, 0.9, 1)}), (0.3, 0.6, 0.9)),
