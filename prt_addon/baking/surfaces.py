@@ -39,6 +39,8 @@ CONSTANT = 0.5 / np.sqrt(np.pi)
 DARKEST = 1e-4
 # Share of the light below which a metal is left black whatever its preset: nobody misses its highlight.
 BLACK_METAL = 0.03
+# Metallic share from which on a mirror is blurred rather than left out, because its light would be missed.
+MISSED_METAL = 0.15
 # Angles of the views from the normal at which exit radiance is measured, each at four azimuths.
 MEASURED_ANGLES = (0.0, 30.0, 60.0, 80.0, 89.0)
 _GREY = 1e-6
@@ -162,7 +164,7 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
     left_out.append(LeftOut(name if choice.kind == "diffuse" else f"sharp reflections of material {material.name}",
                             choice.why, "view-dependent rows"))
     # A metal has no diffuse layer that could stand in: a blurred reflection is nearer the truth than black.
-    return settings.glossy_rows if choice.kind == "mirror" and material.metallic > 0.5 else 0
+    return settings.glossy_rows if choice.kind == "mirror" and material.metallic > MISSED_METAL else 0
 
 
 def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: Indices | None, is_used: bool,
