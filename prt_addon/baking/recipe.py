@@ -314,7 +314,7 @@ class _Bake:
         width = max(kernel.shape[2] for kernel in kernels)
         kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
         surfaces = GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
-                                  np.searchsorted(used, scene.material[points]), kernels)
+                                  np.searchsorted(used, scene.material[points]), kernels, self.surfaces.functions)
         frames, order = surfaces.frames, self.plan.needs.order
         indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
         first_round = 0.3 if self.glossy_bounce else 1.0

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from ..basis.hemisphere import Indices, functions_of, gram_matrix
 from ..basis.spherical_harmonics import expand_bands
+from ..compression.encoding import Encoding
+from ..relighting.exit_radiance import cluster_constants, combine_rows, exit_radiance, hemisphere_values
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..scene.surface_material import SurfaceMaterial
@@ -37,6 +39,10 @@ CONSTANT = 0.5 / np.sqrt(np.pi)
 DARKEST = 1e-4
 # Share of the light below which a metal is left black whatever its preset: nobody misses its highlight.
 BLACK_METAL = 0.03
+# Metallic share from which on a mirror is blurred rather than left out, because its light would be missed.
+MISSED_METAL = 0.15
+# Angles of the views from the normal at which exit radiance is measured, each at four azimuths.
+MEASURED_ANGLES = (0.0, 30.0, 60.0, 80.0, 89.0)
 _GREY = 1e-6
 
 
@@ -158,7 +164,7 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
     left_out.append(LeftOut(name if choice.kind == "diffuse" else f"sharp reflections of material {material.name}",
                             choice.why, "view-dependent rows"))
     # A metal has no diffuse layer that could stand in: a blurred reflection is nearer the truth than black.
-    return settings.glossy_rows if choice.kind == "mirror" and material.metallic > 0.5 else 0
+    return settings.glossy_rows if choice.kind == "mirror" and material.metallic > MISSED_METAL else 0
 
 
 def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: Indices | None, is_used: bool,
@@ -197,3 +203,41 @@ def row_metric(functions: Indices, albedo: NDArray[np.float32]) -> NDArray[np.fl
     metric[0, 0] = 2.0 * np.pi * max(float(np.mean(np.square(albedo, dtype=np.float64))), DARKEST)
     metric[1:, 1:] = gram_matrix(functions)
     return metric
+
+
+@dataclass(frozen=True)
+class WhiteWorld:
+    """Exit radiance of an object under a white world of radiance 1, all receivers and the views of MEASURED_ANGLES.
+
+    Nothing reflects less than 0 or, without light of its own, more than 1: smallest and largest say how far the
+    encoded transfer is from that. mean: over receivers and views weighted by their cosine.
+    """
+
+    smallest: float
+    largest: float
+    mean: float
+
+
+def white_world(encoding: Encoding, shape: tuple[int, int, int], functions: Indices,
+                albedo: NDArray[np.float32]) -> WhiteWorld:
+    """What is drawn of an object in a white world. shape: (rows, columns, channels) of the signal; functions: of rows
+    1, 2, ... (none where it is diffuse); albedo: (p, 3) of the encoded points."""
+    light = np.zeros((shape[1], 3))
+    light[0] = 1.0 / CONSTANT  # of the constant function, for radiance 1
+    constants = cluster_constants(encoding.bases.reshape(*encoding.bases.shape[:2], *shape), light)
+    rows = exit_radiance(encoding.cluster, encoding.weights, constants)
+    smallest, largest, total, weight = np.inf, -np.inf, 0.0, 0.0
+    for view in _measured_views():
+        values = hemisphere_values(tuple(int(i) for i in functions), view[None]) if len(functions) else np.zeros((1, 0))
+        radiance = combine_rows(rows, albedo, np.repeat(values, len(rows), axis=0))
+        smallest, largest = min(smallest, float(radiance.min())), max(largest, float(radiance.max()))
+        total += view[2] * float(radiance.mean(dtype=np.float64))
+        weight += view[2]
+    return WhiteWorld(smallest, largest, total / weight)
+
+
+def _measured_views() -> NDArray[np.float64]:
+    """Views (n, 3) in the frame of a receiver."""
+    angle, turn = np.radians(MEASURED_ANGLES)[:, None], np.arange(4) * np.pi / 2 + np.pi / 8
+    return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn),
+                     np.broadcast_to(np.cos(angle), (len(angle), len(turn)))], axis=-1).reshape(-1, 3)

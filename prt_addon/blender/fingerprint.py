@@ -8,9 +8,11 @@ import numpy as np
 
 from ..storage.digests import digest_arrays, digest_json
 from .materials import material_digest
+from .nodes import reachable
 from .visibility import render_visible_objects
 
-# Attributes that shape the surface or its shading normals; UV maps, colours and our own data do not.
+# Attributes that shape the surface or its shading normals; colours and our own data do not, and UV maps count only
+# where a material samples an image through them.
 SHAPING = ("position", ".corner_vert", "material_index", "sharp_face", "sharp_edge", "custom_normal")
 BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.float32), "INT": ("value", 1, np.int32),
            "BOOLEAN": ("value", 1, np.bool_), "INT16_2D": ("value", 2, np.int32)}
@@ -19,13 +21,14 @@ BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.f
 def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> str | None:
     """Digest of an object's evaluated geometry in its own space, with all it instances; None if it is not evaluated.
 
-    Changes with vertices, faces, sharpness, custom normals and modifiers, not with the object's place in the world.
-    About 2 ms for 50,000 vertices.
+    Changes with vertices, faces, sharpness, custom normals, modifiers and the UV maps that its images are seen through,
+    not with the object's place in the world. About 2 ms for 50,000 vertices.
     """
     evaluated = scene_object.evaluated_get(depsgraph)
     if not evaluated.is_evaluated:
         return None
     parts = [_mesh_digest(evaluated.data)] if isinstance(evaluated.data, bpy.types.Mesh) else []
+    parts += _uv_digests(scene_object)
     if not _instances_nothing(evaluated):
         to_local = np.linalg.pinv(np.array(scene_object.matrix_world, np.float64))  # small
         cache: dict[int, str] = {}
@@ -60,6 +63,34 @@ def _mesh_digest(mesh: bpy.types.Mesh) -> str:
     starts = np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("loop_start", starts)
     return digest_arrays(*arrays, starts)
+
+
+def _uv_digests(scene_object: bpy.types.Object) -> list[str]:
+    """Digests of the UV maps through which the object's materials may show images; none without images.
+
+    Of the object's own mesh: the evaluated one keeps UV maps only while something that is drawn asks for them.
+    """
+    mesh = scene_object.data
+    if not isinstance(mesh, bpy.types.Mesh) or not mesh.uv_layers:
+        return []
+    nodes = [node for material in dict.fromkeys(used_materials(scene_object)) for node in _nodes_of(material)]
+    if not any(getattr(node, "image", None) is not None for node in nodes):
+        return []
+    shown = {node.uv_map for node in nodes if hasattr(node, "uv_map")} | {
+        node.attribute_name for node in nodes if node.bl_idname == "ShaderNodeAttribute"}
+    digests = []
+    for layer in mesh.uv_layers:
+        if layer.active_render or layer.name in shown:
+            values = np.empty(len(mesh.loops) * 2, np.float32)
+            if len(layer.uv) == len(mesh.loops):  # in edit mode the mesh's own data is not there
+                layer.uv.foreach_get("vector", values)
+                digests.append(digest_arrays(values))
+    return digests
+
+
+def _nodes_of(material: bpy.types.Material | None) -> list[bpy.types.Node]:
+    output = material.node_tree.get_output_node("CYCLES") if material is not None and material.node_tree else None
+    return [] if output is None else list(reachable(output))
 
 
 def used_materials(scene_object: bpy.types.Object) -> list[bpy.types.Material | None]:

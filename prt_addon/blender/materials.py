@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cycles_bake import evaluate_corners, scratch_scene
-from .nodes import constant_of, copy_groups, path_of, reachable, shown_images, signature, source_of
+from .nodes import constant_of, copy_groups, origin_of, path_of, reachable, shown_images, signature
+from .surfaces import stand_in_of
 
 if TYPE_CHECKING:
     from .read_scene import MeshArrays
@@ -28,6 +29,7 @@ NO_MATERIAL = (0.8, 0.8, 0.8)  # Cycles' default surface
 BLACK = (0.0, 0.0, 0.0)
 WITHOUT_DIFFUSE = {"ShaderNodeEmission", "ShaderNodeBsdfTransparent", "ShaderNodeBsdfGlass", "ShaderNodeHoldout",
                    "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfRefraction", "ShaderNodeBsdfMetallic"}
+DARKEST = 1e-3  # a diffuse albedo below it shows as black
 VIEW_DEPENDENT_INPUTS = ("Specular IOR Level", "Coat Weight", "Sheen Weight")
 
 
@@ -38,19 +40,20 @@ def constant_albedo(material: bpy.types.Material | None) -> tuple[float, float, 
     if material.node_tree is None:
         return _clipped(material.diffuse_color)
     output = material.node_tree.get_output_node("CYCLES")
-    surface = source_of(output.inputs["Surface"]) if output is not None else None
-    if surface is None:
+    found, _, groups = origin_of(output.inputs["Surface"]) if output is not None else (None, None, ())
+    if found is None:
         return BLACK
+    surface = found.node
     if surface.mute:
         return None
     if surface.bl_idname in WITHOUT_DIFFUSE:
         return BLACK
     if surface.bl_idname == "ShaderNodeBsdfDiffuse":
-        colour = constant_of(surface.inputs["Color"])
+        colour = constant_of(surface.inputs["Color"], groups)
         return None if colour is None else _clipped(colour)
     if surface.bl_idname != "ShaderNodeBsdfPrincipled":
         return None
-    values = [constant_of(surface.inputs[name])
+    values = [constant_of(surface.inputs[name], groups)
               for name in ("Base Color", "Metallic", "Transmission Weight", "Alpha")]
     if any(value is None for value in values):
         return None
@@ -80,6 +83,7 @@ def material_digest(materials: list[bpy.types.Material | None]) -> str:
 class _Request:
     """A mesh whose albedo Cycles has to evaluate, and where the result goes."""
 
+    name: str
     evaluated: bpy.types.Object
     generated_mesh: bpy.types.Mesh | None
     depsgraph: bpy.types.Depsgraph
@@ -88,6 +92,7 @@ class _Request:
     materials: list[bpy.types.Material | None]
     matrix: NDArray[np.float64]
     result: NDArray[np.float32]
+    slot: NDArray[np.int32]
 
 
 def missing_images(material: bpy.types.Material) -> list[str]:
@@ -127,8 +132,22 @@ class AlbedoReader:
         table = np.array([BLACK if c is None else c for c in constants], np.float32)
         result[:] = table[slot][:, None, :]
         if by_cycles[slot].any():
-            self._requests.append(_Request(evaluated, generated_mesh, depsgraph, arrays.corners, by_cycles[slot],
-                                           slots, matrix, result))
+            self._requests.append(_Request(evaluated.name, evaluated, generated_mesh, depsgraph, arrays.corners,
+                                           by_cycles[slot], slots, matrix, result, slot))
+        self._stand_in(evaluated.name, slots, slot, ~by_cycles[slot], result)
+
+    def _stand_in(self, name: str, slots: list[bpy.types.Material | None], slot: NDArray[np.int32],
+                  known: NDArray[np.bool_], result: NDArray[np.float32]) -> None:
+        """A colour, and a warning, for materials that came out black because their highlight is not baked."""
+        for number, material in enumerate(slots):
+            chosen = known & (slot == number)
+            if not chosen.any() or result[chosen].max() > DARKEST:
+                continue
+            found = stand_in_of(material)
+            if found is not None:
+                result[chosen] = np.asarray(found[0], np.float32)
+                self._warnings.append(f"{name}: material {material.name} is drawn as diffuse with colour "
+                                      f"{', '.join(f'{c:.2f}' for c in found[0])}: {found[1]}")
 
     def _constant(self, material: bpy.types.Material | None) -> tuple[float, float, float] | None:
         if material not in self._constants:
@@ -153,6 +172,7 @@ class AlbedoReader:
                     colours = evaluate_corners(scratch, mesh, request.matrix, "DIFFUSE")
                     chosen = request.by_cycles
                     request.result[chosen] = np.clip(colours, 0.0, 1.0)[request.corners[chosen]]
+                    self._stand_in(request.name, request.materials, request.slot, chosen, request.result)
         finally:
             for mesh in meshes:
                 bpy.data.meshes.remove(mesh)

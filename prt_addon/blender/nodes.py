@@ -17,33 +17,66 @@ IGNORED = {"rna_type", "location", "location_absolute", "width", "height", "labe
 PLAIN = {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"}
 
 
-def source_of(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
-    """The node that feeds an input socket, past reroutes; None where nothing does.
+Groups = tuple[bpy.types.Node, ...]  # the group nodes that a socket lies in, the outermost first
 
-    A muted link counts as none, as in Cycles.
+
+def origin_of(socket: bpy.types.NodeSocket, groups: Groups | None = (),
+              ) -> tuple[bpy.types.NodeSocket | None, bpy.types.NodeSocket, Groups | None]:
+    """What feeds an input socket, past reroutes and through the walls of node groups.
+
+    Gives the output socket (None where nothing feeds it), the input socket that it (or else the value) was found at,
+    and the groups that one lies in. A muted link counts as none, as in Cycles. A muted group is given as it is, and
+    with groups None so is every other.
     """
     while socket.is_linked:
         link = socket.links[0]
         if link.is_muted or not link.is_valid:
-            return None
-        if link.from_node.bl_idname != "NodeReroute":
-            return link.from_node
-        socket = link.from_node.inputs[0]
-    return None
+            return None, socket, groups
+        node, output = link.from_node, link.from_socket
+        if node.bl_idname == "NodeReroute":
+            socket = node.inputs[0]
+        elif node.bl_idname == "NodeGroupInput" and groups:
+            found = _same_socket(groups[-1].inputs, output.identifier)
+            if found is None:
+                return output, socket, groups
+            socket, groups = found, groups[:-1]
+        elif node.bl_idname == "ShaderNodeGroup" and groups is not None and node.node_tree and not node.mute:
+            results = (n for n in node.node_tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output)
+            inner = next(results, None)
+            found = None if inner is None else _same_socket(inner.inputs, output.identifier)
+            if found is None:
+                return output, socket, groups
+            socket, groups = found, (*groups, node)
+        else:
+            return output, socket, groups
+    return None, socket, groups
 
 
-def constant_of(socket: bpy.types.NodeSocket) -> tuple[float, ...] | float | None:
+def _same_socket(sockets: bpy.types.NodeInputs, identifier: str) -> bpy.types.NodeSocket | None:
+    return next((socket for socket in sockets if socket.identifier == identifier), None)
+
+
+def source_of(socket: bpy.types.NodeSocket, groups: Groups | None = None) -> bpy.types.Node | None:
+    """The node that feeds an input socket, see `origin_of`; None where nothing does."""
+    output = origin_of(socket, groups)[0]
+    return None if output is None else output.node
+
+
+def constant_of(socket: bpy.types.NodeSocket, groups: Groups | None = None) -> tuple[float, ...] | float | None:
     """The value of a socket that is unlinked or fed by a plain Colour or Value node; None where it varies."""
-    node = source_of(socket)
-    if node is None:
-        value = socket.default_value
-    elif node.mute:
+    output, place, _ = origin_of(socket, groups)
+    kind = socket.type
+    if output is None:
+        if not hasattr(place, "default_value") or (place.type == "RGBA") != (kind == "RGBA"):
+            return None  # a colour that a group takes as a number or the other way round
+        value = place.default_value
+    elif output.node.mute:
         return None
-    elif node.bl_idname in {"ShaderNodeRGB", "ShaderNodeValue"}:
-        same_kind = (node.bl_idname == "ShaderNodeRGB") == (socket.type == "RGBA")
+    elif output.node.bl_idname in {"ShaderNodeRGB", "ShaderNodeValue"}:
+        same_kind = (output.node.bl_idname == "ShaderNodeRGB") == (kind == "RGBA")
         if not same_kind:
             return None
-        value = node.outputs[0].default_value
+        value = output.node.outputs[0].default_value
     else:
         return None
     return float(value) if isinstance(value, (float, int)) else tuple(float(v) for v in value)

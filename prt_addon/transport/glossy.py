@@ -10,16 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.directions import tangent_frames
+from ..basis.hemisphere import Indices
 from ..basis.spherical_harmonics import order_of, rotations
 from ..basis.triple_product import triple_products
 from ..linear_algebra import multiply, small_batched_multiply
 from ..tracing.tracer import Tracer
 from .incident_light import BLOCK, NUMBERS, IndirectLight
+from .positivity import OpenSurface, keep_positive
 
 
 @dataclass(frozen=True)
@@ -27,12 +30,14 @@ class GlossySurfaces:
     """What reflects at g glossy receivers.
 
     frames: (g, 3, 3) orthonormal, rows tangent, bitangent, normal (`surface_frames`); material: (g,) places in kernels;
-    kernels: K of each material, (rows, incident functions, channels), all of one shape.
+    kernels: K of each material, (rows, incident functions, channels), all of one shape; functions: of the rows, to keep
+    the exit radiance above black in a white world (`positivity`); None leaves the rows as they are fitted.
     """
 
     frames: NDArray[np.float64]
     material: NDArray[np.int64]
     kernels: tuple[NDArray[np.float64], ...]
+    functions: Indices | None = None
 
     def __post_init__(self) -> None:
         shapes = {np.shape(kernel) for kernel in self.kernels}
@@ -46,6 +51,11 @@ class GlossySurfaces:
     def incident_order(self) -> int:
         """Order of the functions that incident radiance is expressed in."""
         return order_of(self.kernels[0].shape[1])
+
+    @cached_property
+    def open_surfaces(self) -> tuple[OpenSurface, ...]:
+        """What each material returns of a white world; none where the rows' functions are not known."""
+        return () if self.functions is None else tuple(OpenSurface.of(k, self.functions) for k in self.kernels)
 
 
 def surface_frames(normals: NDArray[np.float64], tangents: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,5 +150,7 @@ def _reflect(surfaces: GlossySurfaces, part: slice, incident: NDArray[np.float32
                                             np.ascontiguousarray(light[..., min(c, light.shape[3] - 1)]))
                      for c in range(out.shape[3])]
         place = slice(None) if len(members) == len(material) else members
-        for channel, values in enumerate(reflected):
-            out[place, ..., channel] = values
+        rows = np.stack(reflected, axis=-1)
+        if surfaces.open_surfaces:
+            keep_positive(rows, surfaces.open_surfaces[number])
+        out[place] = rows

@@ -13,6 +13,8 @@ import pytest
 from mathutils import Matrix
 
 from prt_addon.blender.cycles_bake import evaluate_corners, scratch_scene
+from prt_addon.blender.fingerprint import geometry_digest
+from prt_addon.blender.materials import constant_albedo
 from prt_addon.blender.read_scene import read_objects
 from prt_addon.blender.surfaces import SurfaceReader
 from prt_addon.scene.scene_mesh import SceneMesh
@@ -142,15 +144,170 @@ def test_textures_have_a_stand_in_and_a_warning(scene: bpy.types.Scene) -> None:
     assert warnings and "Material M" in warnings[0] and "Roughness" in warnings[0]
 
 
-def test_a_mixed_shader_is_diffuse_and_says_so(scene: bpy.types.Scene) -> None:
+def mixed(share: float | None, *kinds: tuple[str, dict[str, object]], shader: str = "ShaderNodeMixShader") -> Build:
     def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
-        mix = tree.nodes.new("ShaderNodeMixShader")
-        for index, kind in enumerate(("ShaderNodeBsdfDiffuse", "ShaderNodeBsdfAnisotropic")):
-            tree.links.new(tree.nodes.new(kind).outputs[0], mix.inputs[1 + index])
-        tree.links.new(mix.outputs[0], output.inputs["Surface"])
+        node = tree.nodes.new(shader)
+        if share is not None:
+            node.inputs[0].default_value = share
+        for index, (kind, values) in enumerate(kinds):
+            part = tree.nodes.new(kind)
+            for name, value in values.items():
+                part.inputs[name].default_value = value
+            tree.links.new(part.outputs[0], node.inputs[index + (share is not None)])
+        tree.links.new(node.outputs[0], output.inputs["Surface"])
+    return build
+
+
+METAL = ("ShaderNodeBsdfPrincipled", {"Metallic": 1.0, "Base Color": (0.9, 0.5, 0.1, 1), "Roughness": 0.2})
+PLASTIC = ("ShaderNodeBsdfPrincipled", {"Roughness": 0.6})
+CHALK, CLEAR = ("ShaderNodeBsdfDiffuse", {}), ("ShaderNodeBsdfTransparent", {})
+
+
+def test_a_mix_is_one_surface_with_mixed_parameters_and_says_so(scene: bpy.types.Scene) -> None:
     warnings: list[str] = []
-    assert read(build, warnings) == DIFFUSE
-    assert "only its diffuse part" in warnings[0]
+    found = read(mixed(0.25, PLASTIC, METAL), warnings)
+    assert found.metallic == pytest.approx(0.25) and found.specular_level == pytest.approx(0.5)
+    assert found.base_colour == pytest.approx((0.9, 0.5, 0.1)) and 0.2 < found.roughness < 0.6
+    assert found.name == "M" and len(warnings) == 1 and "mixed parameters" in warnings[0]
+    half = read(mixed(0.5, CHALK, METAL))
+    assert half.metallic == pytest.approx(0.5) and half.specular_level == 0.0 and half.name[0] == "M"
+    assert half.base_colour == pytest.approx((0.9, 0.5, 0.1)) and half.roughness == pytest.approx(0.2)
+    assert read(mixed(1.0, PLASTIC, METAL)).metallic == 1.0 and read(mixed(0.0, CHALK, METAL)) == DIFFUSE
+    assert read(mixed(0.5, CHALK, CHALK), warnings) == DIFFUSE
+    assert read(mixed(0.4, CLEAR, METAL)).metallic == 1.0
+
+
+def grouped(depth: int, values: dict[str, object], linked_roughness: bool = False) -> Build:
+    """A Principled BSDF `depth` groups deep, whose Metallic, Base Color and Roughness are inputs of every group."""
+    kinds = {"Metallic": "NodeSocketFloat", "Base Color": "NodeSocketColor", "Roughness": "NodeSocketFloat"}
+
+    def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        inner: bpy.types.NodeTree | None = None
+        for _ in range(depth):
+            group = bpy.data.node_groups.new("Paint", "ShaderNodeTree")
+            group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
+            for name, kind in kinds.items():
+                group.interface.new_socket(name, in_out="INPUT", socket_type=kind)
+            outside, result = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+            node = group.nodes.new("ShaderNodeGroup" if inner else "ShaderNodeBsdfPrincipled")
+            if inner:
+                node.node_tree = inner
+            for name in kinds:
+                group.links.new(outside.outputs[name], node.inputs[name])
+            group.links.new(node.outputs[0], result.inputs[0])
+            inner = group
+        node = tree.nodes.new("ShaderNodeGroup")
+        node.node_tree = inner
+        for name, value in values.items():
+            node.inputs[name].default_value = value
+        if linked_roughness:
+            value = tree.nodes.new("ShaderNodeValue")
+            value.outputs[0].default_value = 0.35
+            tree.links.new(value.outputs[0], node.inputs["Roughness"])
+        tree.links.new(node.outputs[0], output.inputs["Surface"])
+    return build
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_principled_is_read_through_groups(scene: bpy.types.Scene, depth: int) -> None:
+    warnings: list[str] = []
+    values = {"Metallic": 1.0, "Base Color": (0.9, 0.5, 0.1, 1), "Roughness": 0.7}
+    found = read(grouped(depth, values, linked_roughness=True), warnings)
+    assert found.metallic == 1.0 and found.base_colour == pytest.approx((0.9, 0.5, 0.1))
+    assert found.roughness == pytest.approx(0.35) and not warnings
+    plain = add_material("P", grouped(depth, {"Base Color": (0.2, 0.4, 0.6, 1)}))
+    assert constant_albedo(plain) == pytest.approx((0.2, 0.4, 0.6))
+
+
+def test_metallic_is_a_metal(scene: bpy.types.Scene) -> None:
+    tint = {"Base Color": (0.9, 0.5, 0.1, 1), "Edge Tint": (0.5, 0.6, 0.7, 1), "Roughness": 0.3}
+    found = read(one_node("ShaderNodeBsdfMetallic", tint, fresnel_type="F82"))
+    assert found.base_colour == pytest.approx((0.9, 0.5, 0.1)) and found.specular_tint == pytest.approx((0.5, 0.6, 0.7))
+    assert found.metallic == 1.0 and found.roughness == pytest.approx(0.3) and found.specular_level == 0.0
+    gold = read(one_node("ShaderNodeBsdfMetallic", {"IOR": (0.18, 0.42, 1.37), "Extinction": (3.42, 2.35, 1.77)},
+                         fresnel_type="PHYSICAL_CONDUCTOR"))
+    assert gold.base_colour == pytest.approx((0.944, 0.776, 0.373), abs=2e-3)
+
+
+def test_other_lobes_than_ggx_are_named(scene: bpy.types.Scene) -> None:
+    warnings: list[str] = []
+    read(one_node("ShaderNodeBsdfAnisotropic", distribution="ASHIKHMIN_SHIRLEY"), warnings)
+    assert len(warnings) == 1 and "Ashikhmin-Shirley" in warnings[0]
+    read(one_node("ShaderNodeBsdfAnisotropic", distribution="GGX"), warnings)
+    assert len(warnings) == 1
+
+
+@pytest.mark.parametrize(("build", "colour"), [
+    (one_node("ShaderNodeBsdfGlass", {"Color": (0.3, 0.6, 0.9, 1)}), (0.3, 0.6, 0.9)),
+    (one_node("ShaderNodeBsdfRefraction", {"Color": (0.3, 0.6, 0.9, 1)}), (0.3, 0.6, 0.9)),
+    (one_node("ShaderNodeBsdfPrincipled", {"Transmission Weight": 1.0, "Base Color": (0.3, 0.6, 0.9, 1)}),
+     (0.3, 0.6, 0.9)),
+    (mixed(None, METAL, CLEAR, shader="ShaderNodeAddShader"), (0.9, 0.5, 0.1)),
+])
+def test_what_is_not_read_is_not_black(scene: bpy.types.Scene, build: Build, colour: tuple[float, ...]) -> None:
+    cube, warnings = add_cube("Vase"), []
+    cube.data.materials.append(add_material("Odd", build))
+    mesh, = read_objects(depsgraph(), None, warnings)
+    assert np.allclose(mesh.corner_albedo, colour, atol=1e-3)
+    line, = (w for w in warnings if "drawn as diffuse" in w)
+    assert line.startswith("Vase: material Odd") and "node" in line and ";" in line
+
+
+@pytest.mark.parametrize("build", [
+    one_node("ShaderNodeBsdfDiffuse", {"Color": (0, 0, 0, 1)}), one_node("ShaderNodeEmission"),
+    one_node("ShaderNodeBsdfPrincipled", {"Metallic": 1.0}), mixed(0.5, METAL, METAL), grouped(1, {"Metallic": 1.0}),
+    one_node("ShaderNodeBsdfPrincipled", {"Base Color": (0, 0, 0, 1)})])
+def test_what_is_black_or_a_metal_has_no_diffuse_colour(scene: bpy.types.Scene, build: Build) -> None:
+    cube, warnings = add_cube(), []
+    cube.data.materials.append(add_material("Black", build))
+    mesh, = read_objects(depsgraph(), None, warnings)
+    assert mesh.corner_albedo.max() < 1e-3 and not any("drawn as diffuse" in w for w in warnings)
+
+
+@pytest.mark.parametrize("name", ["Coat Weight", "Sheen Weight", "Transmission Weight", "Thin Film Thickness"])
+def test_what_is_left_out_is_named(scene: bpy.types.Scene, name: str) -> None:
+    warnings: list[str] = []
+    read(one_node("ShaderNodeBsdfPrincipled", {name: 0.5}), warnings)
+    assert len(warnings) == 1 and name in warnings[0] and "left out" in warnings[0]
+    warnings.clear()
+    read(one_node("ShaderNodeBsdfPrincipled", {}), warnings)
+    assert not warnings
+
+
+def test_a_channel_or_the_alpha_of_an_image_is_what_is_averaged(scene: bpy.types.Scene) -> None:
+    image = bpy.data.images.new("packed", 2, 1, is_data=True, alpha=True)
+    image.pixels.foreach_set(np.array([0.2, 0.4, 0.6, 0.8, 0.2, 0.2, 0.6, 0.4], np.float32))
+
+    def build(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        node, texture = tree.nodes.new("ShaderNodeBsdfPrincipled"), tree.nodes.new("ShaderNodeTexImage")
+        parts = tree.nodes.new("ShaderNodeSeparateColor")
+        texture.image = image
+        tree.links.new(texture.outputs["Color"], parts.inputs[0])
+        tree.links.new(parts.outputs["Green"], node.inputs["Roughness"])
+        tree.links.new(parts.outputs["Blue"], node.inputs["Metallic"])
+        tree.links.new(texture.outputs["Alpha"], node.inputs["Specular IOR Level"])
+        tree.links.new(node.outputs[0], output.inputs["Surface"])
+    found = read(build)
+    assert (found.roughness, found.metallic, found.specular_level) == pytest.approx((0.3, 0.6, 0.6), abs=5e-3)
+
+
+def test_uv_maps_count_where_images_are_seen_through_them(scene: bpy.types.Scene) -> None:
+    cube = add_cube()
+    for name in ("shown", "other"):
+        cube.data.uv_layers.new(name=name)
+    cube.data.uv_layers["shown"].active_render = True
+    cube.data.materials.append(add_material("Plain", one_node("ShaderNodeBsdfPrincipled")))
+
+    def moved(layer: str) -> bool:
+        before = geometry_digest(cube, depsgraph())
+        cube.data.uv_layers[layer].uv[0].vector = np.array(cube.data.uv_layers[layer].uv[0].vector) + 0.25
+        cube.data.update()
+        return geometry_digest(cube, depsgraph()) != before
+    assert not moved("shown") and not moved("other")
+    image = bpy.data.images.new("picture", 2, 2)
+    cube.data.materials[0] = add_material("Textured", linked(
+        "ShaderNodeTexImage", "Color", "Base Color", lambda n: setattr(n, "image", image)))
+    assert moved("shown") and not moved("other")
 
 
 def test_slots_materials_and_instances_reach_the_receivers(scene: bpy.types.Scene) -> None:
