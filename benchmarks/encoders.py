@@ -19,8 +19,10 @@ scikit-learn and faiss are no dependencies of the add-on, and left out with a li
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import importlib.util
+import io
 import json
 import os
 import subprocess
@@ -288,6 +290,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--sweeps", type=int, default=10, help="most LBG sweeps per vector of the plain implementation")
     parser.add_argument("--plain", action="store_true", help="also run the plain whole-array implementation")
+    parser.add_argument("--docs", action="store_true", help="also write to docs/paper_tables.md, with --transfer")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     parser.add_argument("--threads", type=int, default=1, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -305,9 +308,15 @@ def main() -> None:
         print(json.dumps(vars(measure(signal, options))))
         return
     points, values = signal.shape
-    print(f"{options.transfer or options.signal or 'synthetic'}: {points} points x {values} values, "
-          f"{options.clusters} clusters, {options.vectors} vectors")
-    compare(signal, options)
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        print(f"{options.transfer or options.signal or 'synthetic'}: {points} points x {values} values, "
+              f"{options.clusters} clusters, {options.vectors} vectors\n")
+        compare(signal, options)
+    print(text.getvalue())
+    if options.docs:
+        from common import write_block
+        write_block(ROOT / "docs" / "paper_tables.md", f"encoders {options.transfer}", text.getvalue().strip())
 
 
 if __name__ == "__main__":
