@@ -89,7 +89,7 @@ def table_1(cache: Path, chosen: str) -> str:
     """All signals and encoders beside the paper's, the ratios, and the errors over the hemisphere."""
     rows, ratios, hemisphere = [], [], []
     for name in TABLE:
-        if chosen not in name:
+        if not name.startswith(chosen):
             continue
         signal, vectors, metric = signal_of(name, cache), SIGNALS[name].vectors, SIGNALS[name].metric
         runs = {method: run(signal, vectors, method) for method in METHODS}
@@ -228,7 +228,7 @@ PARTS = {"table": table_1, "figure2": figure_2, "figure3": figure_3, "figure10":
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=list(PARTS), metavar="PART", help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--signals", default="", help="in the table, only those whose name has this in it")
+    parser.add_argument("--signals", default="", help="in the table, only those whose name starts so")
     parser.add_argument("--docs", action="store_true", help="also write to docs/paper_tables.md")
     parser.add_argument("--cache", type=Path, default=ROOT / "build" / "paper_tables")
     arguments = parser.parse_args()

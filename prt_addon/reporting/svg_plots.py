@@ -56,25 +56,23 @@ def bars(rows: Sequence[tuple[str, float, str]], title: str) -> str:
 
 
 class _LogAxis:
-    """Positions of positive values between two powers of ten."""
+    """Positions of positive values between two powers of ten, or, within two decades, two of 1, 2, 5, 10, 20, ..."""
 
     def __init__(self, low: float, high: float, start: float, end: float) -> None:
-        self.first, self.last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-        self.last += self.first == self.last
+        first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+        last += first == last
+        self.ticks = [10.0 ** power for power in range(first, last + 1, max(1, round((last - first) / 8)))]
+        if last - first <= 2:
+            steps = sorted(self.ticks + [digit * power for power in self.ticks[:-1] for digit in (2.0, 5.0)])
+            below, above = sum(step <= low for step in steps) - 1, sum(step < high for step in steps)
+            self.ticks = steps[max(below, 0):above + 1]
+            first, last = math.log10(self.ticks[0]), math.log10(self.ticks[-1])
+        self.first, self.last = first, last
         self.start, self.end = start, end
 
     def position(self, value: float) -> float:
         share = (math.log10(max(value, 10.0 ** self.first)) - self.first) / (self.last - self.first)
         return self.start + min(share, 1.0) * (self.end - self.start)
-
-    @property
-    def ticks(self) -> list[float]:
-        decades = self.last - self.first
-        step = max(1, round(decades / 8))
-        powers = [10.0 ** power for power in range(self.first, self.last + 1, step)]
-        if decades > 2:
-            return powers
-        return sorted(powers + [digit * power for power in powers[:-1] for digit in (2.0, 5.0)])
 
 
 @dataclass(frozen=True)
