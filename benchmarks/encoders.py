@@ -12,8 +12,8 @@ compare processor seconds of one thread. --plain is slow: minutes at 50,000 poin
 
 scikit-learn and faiss are no dependencies of the add-on, and left out with a line where absent. To have them:
 
-    python3.13 -m venv /tmp/peers && /tmp/peers/bin/pip install numpy scipy scikit-learn faiss-cpu
-    /tmp/peers/bin/python benchmarks/encoders.py ...     (a signal that is not cached yet needs the add-on's wheels too)
+    python3.13 -m venv build/peers && build/peers/bin/pip install numpy scipy scikit-learn faiss-cpu
+    build/peers/bin/python benchmarks/encoders.py ...     (a signal that is not cached yet needs the add-on's wheels too)
 """
 
 from __future__ import annotations

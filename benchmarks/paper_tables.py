@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Clustered PCA beside Table 1 and Figures 2, 3, 10 and 11 of Sloan et al. 2003.
 
-    python benchmarks/paper_tables.py table                        some two minutes; timings want a quiet machine
-    python benchmarks/paper_tables.py figure2 figure3              some three minutes
-    python benchmarks/paper_tables.py figure10 figure11            some three minutes
+    python benchmarks/paper_tables.py table                        some three minutes; timings want a quiet machine
+    python benchmarks/paper_tables.py figure2 figure3              five minutes on two shared cores
+    python benchmarks/paper_tables.py figure10 figure11            four minutes
 
 Each part prints Markdown; --docs also writes it to its place in docs/paper_tables.md, and the plots beside it. Signals
 (paper_signals.py) are kept in the cache folder. Squared errors are of other transfer than the paper's (its BRDFs and
