@@ -13,7 +13,7 @@ compare processor seconds of one thread. --plain is slow: minutes at 50,000 poin
 scikit-learn and faiss are no dependencies of the add-on, and left out with a line where absent. To have them:
 
     python3.13 -m venv build/peers && build/peers/bin/pip install numpy scipy scikit-learn faiss-cpu
-    build/peers/bin/python benchmarks/encoders.py ...     (a signal that is not cached yet needs the add-on's wheels too)
+    build/peers/bin/python benchmarks/encoders.py ...     (a signal not cached yet needs the add-on's wheels too)
 """
 
 from __future__ import annotations
@@ -240,7 +240,7 @@ def print_floors(found: dict[str, Measured], values: int, vectors: int) -> None:
     def verdict(ratio: float, floor: float) -> str:
         if not np.isfinite(floor):
             return f"{ratio:.3f}"
-        return f"{ratio:.3f}, floor {floor:.3g}: {'met' if ratio <= floor else 'MISSED'}"
+        return f"{ratio:.3f}, floor {floor:.4g}: {'met' if ratio <= floor else 'MISSED'}"
     print("\n| one thread | squared error, ratio | processor seconds, ratio |\n| --- | --- | --- |")
     for name, error, most_error, seconds, most_seconds in floors(found, values, vectors):
         print(f"| {name} | {verdict(error, most_error)} | {verdict(seconds, most_seconds)} |")
