@@ -71,12 +71,27 @@ def best_of(runs: int, work: Callable[[], Any]) -> tuple[float, Any]:
     return least, result
 
 
+def markdown_table(header: list[str], rows: list[list[Any]]) -> str:
+    """A Markdown table; floats to four digits."""
+    def cell(value: Any) -> str:
+        if not isinstance(value, float):
+            return str(value)
+        return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
+    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(cell(value) for value in row) + " |" for row in rows])
+
+
 def print_table(header: list[str], rows: list[list[Any]]) -> None:
-    """A Markdown table."""
-    print("| " + " | ".join(header) + " |")
-    print("|" + " --- |" * len(header))
-    for row in rows:
-        print("| " + " | ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) + " |")
+    """Print a Markdown table."""
+    print(markdown_table(header, rows))
+
+
+def write_block(path: Path, name: str, text: str) -> None:
+    """Replace what stands between <!-- name --> and <!-- /name --> in a document. Raises ValueError without them."""
+    content = path.read_text()
+    start, end = (content.index(f"<!-- {mark}{name} -->") for mark in ("", "/"))
+    start += len(f"<!-- {name} -->")
+    path.write_text(f"{content[:start]}\n\n{text}\n\n{content[end:]}")
 
 
 COLOURS = ("#2a6f97", "#c8553d", "#588157", "#9c6644", "#7b5ea7")

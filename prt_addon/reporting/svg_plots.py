@@ -56,21 +56,53 @@ def bars(rows: Sequence[tuple[str, float, str]], title: str) -> str:
 
 
 class _LogAxis:
-    """Positions of positive values between two powers of ten."""
+    """Positions of positive values between two powers of ten, or, within two decades, two of 1, 2, 5, 10, 20, ..."""
 
     def __init__(self, low: float, high: float, start: float, end: float) -> None:
-        self.first, self.last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-        self.last += self.first == self.last
+        first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+        last += first == last
+        self.ticks = [10.0 ** power for power in range(first, last + 1, max(1, round((last - first) / 8)))]
+        if last - first <= 2:
+            steps = sorted(self.ticks + [digit * power for power in self.ticks[:-1] for digit in (2.0, 5.0)])
+            below, above = sum(step <= low for step in steps) - 1, sum(step < high for step in steps)
+            self.ticks = steps[max(below, 0):above + 1]
+            first, last = math.log10(self.ticks[0]), math.log10(self.ticks[-1])
+        self.first, self.last = first, last
         self.start, self.end = start, end
 
     def position(self, value: float) -> float:
         share = (math.log10(max(value, 10.0 ** self.first)) - self.first) / (self.last - self.first)
         return self.start + min(share, 1.0) * (self.end - self.start)
 
+
+@dataclass(frozen=True)
+class _LinearAxis:
+    """Positions of values from 0 to the largest."""
+
+    largest: float
+    start: float
+    end: float
+
+    def position(self, value: float) -> float:
+        return self.start + (self.end - self.start) * value / self.largest
+
     @property
     def ticks(self) -> list[float]:
-        step = max(1, round((self.last - self.first) / 8))
-        return [10.0 ** power for power in range(self.first, self.last + 1, step)]
+        return [0.0, 0.5 * self.largest, self.largest]
+
+
+def _x_axis(values: Sequence[float], logarithmic: bool, start: float, end: float) -> _LogAxis | _LinearAxis:
+    if logarithmic:
+        return _LogAxis(min(values), max(values), start, end)
+    return _LinearAxis(max(values) or 1.0, start, end)
+
+
+def _short(value: float) -> str:
+    """A number on an axis: 2500000 -> "2.5 M"."""
+    for size, letter in ((1e6, " M"), (1e3, " k")):
+        if value >= size:
+            return f"{value / size:.3g}{letter}"
+    return f"{value:.3g}"
 
 
 def percent(value: float) -> str:
@@ -108,27 +140,29 @@ def intervals(rows: Sequence[Interval], zones: Sequence[tuple[float, str]], titl
     return _svg(bottom + 22, parts, title)
 
 
-def curves(series: Sequence[Curve], x_name: str, y_name: str, title: str, as_percent: bool = True) -> str:
-    """Lines over a linear x axis from 0 and a logarithmic y axis. Empty text where there is nothing to draw."""
-    drawn = [Curve(c.label, [(x, y) for x, y in c.points if y > 0.0]) for c in series]
+def curves(series: Sequence[Curve], x_name: str, y_name: str, title: str, as_percent: bool = True,
+           log_x: bool = False) -> str:
+    """Lines over a linear x axis from 0, or a logarithmic one, and a logarithmic y axis. Empty text where there is
+    nothing to draw."""
+    drawn = [Curve(c.label, [(x, y) for x, y in c.points if y > 0.0 and (x > 0.0 or not log_x)]) for c in series]
     drawn = [c for c in drawn if len(c.points) > 1]
     if not drawn:
         return ""
     height, bottom, left, right = 250, 210, 74, WIDTH - 190
     values = [y for c in drawn for _, y in c.points]
     axis = _LogAxis(min(values), max(values), bottom, 26)
-    end = max(x for c in drawn for x, _ in c.points) or 1.0
+    across = _x_axis([x for c in drawn for x, _ in c.points], log_x, left, right)
     parts = [_text(left, 14, y_name, "quiet small")]
     for tick in axis.ticks:
         y = axis.position(tick)
         parts.append(f'<line x1="{left}" y1="{y:.1f}" x2="{right}" y2="{y:.1f}" class="grid"/>')
-        parts.append(_text(left - 8, y + 4, percent(tick) if as_percent else f"{tick:g}", "quiet small", "end"))
-    for share in (0.0, 0.5, 1.0):
-        parts.append(_text(left + share * (right - left), bottom + 18, f"{share * end:.3g}", "quiet small", "middle"))
+        parts.append(_text(left - 8, y + 4, percent(tick) if as_percent else _short(tick), "quiet small", "end"))
+    for tick in across.ticks:
+        parts.append(_text(across.position(tick), bottom + 18, _short(tick), "quiet small", "middle"))
     parts.append(_text((left + right) / 2, bottom + 36, x_name, "quiet small", "middle"))
     for index, curve in enumerate(drawn):
         style = SERIES_CLASSES[index % len(SERIES_CLASSES)]
-        places = [(left + (right - left) * x / end, axis.position(y)) for x, y in curve.points]
+        places = [(across.position(x), axis.position(y)) for x, y in curve.points]
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline points="{line}" class="curve {style}"/>')
         parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" class="mark {style}"/>' for x, y in places]

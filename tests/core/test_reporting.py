@@ -217,6 +217,18 @@ def test_logarithmic_axis_spaces_decades_evenly() -> None:
     assert svg_plots.curves([svg_plots.Curve("c", [(0.0, 0.0), (1.0, 0.0)])], "x", "y", "title") == ""
 
 
+def test_logarithmic_x_axis_and_close_ticks() -> None:
+    """Doublings are evenly spaced on a logarithmic x axis, and two values within a decade stand between close ticks."""
+    plot = svg_plots.curves([svg_plots.Curve("c", [(32.0, 30.0), (64.0, 40.0), (128.0, 90.0)])], "x", "y", "title",
+                            as_percent=False, log_x=True)
+    root = ElementTree.fromstring(plot)
+    points = next(e for e in root.iter("polyline")).get("points", "").split()
+    (x0, _), (x1, _), (x2, _) = ([float(v) for v in p.split(",")] for p in points)
+    assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2) and x1 - x0 > 50
+    assert {"20", "50", "100", "200"} <= {e.text for e in root.iter("text")}
+    assert "10" not in {e.text for e in root.iter("text")}
+
+
 @pytest.mark.parametrize(("value", "text"), [
     (0.0, "0 %"), (0.012, "1.2 %"), (0.00021, "0.021 %"), (1.0, "100 %"), (0.5, "50 %"), (0.0996, "10 %"),
 ])
