@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .global_frame import GlobalFrame
 from .monitor import Monitor
-from .neighbours import Neighbours, Sweep, nearest_of_all, reclassify_near
+from .neighbours import Neighbours, Sweep, nearest_of_all, reclassify_all, reclassify_near
 from .rebalancing import exchange, rebalance
 from .reclassify import reclassify
 from .seeding import split_seeds
@@ -43,6 +43,9 @@ WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
 EXACT = 2.0
 # Most rounds of rearranging clusters.
 ROUNDS = 2
+# Of wide signals: sweeps for each number of vectors, which of them looks at all subspaces, and LBG iterations before
+# them.
+WIDE_SWEEPS, SURVEY, LBG_ITERATIONS = 4, 1, 6
 
 
 @dataclass
@@ -65,11 +68,15 @@ class Work:
         state.resize(width, state.bases.shape[1])
         return update(self.frame.coordinates[:, :width], state, self.monitor.workers) + float(self.frame.tail[width])
 
-    def sweep(self, state: Subspaces, error: float) -> tuple[Sweep, float]:
-        """One classification among neighbours and one update, on as many values as the error asks for."""
+    def sweep(self, state: Subspaces, error: float, survey: bool = False) -> tuple[Sweep, float]:
+        """One classification among neighbours (survey: among all) and one update, on as many values as the error asks
+        for."""
         width = state.means.shape[1]
         data, before = self.frame.coordinates[:, :width], state.labels
-        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers)
+        if survey:
+            sweep = reclassify_all(data, state, self.monitor.workers)
+        else:
+            sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers)
         self.neighbours.learn(before, state.labels, sweep.runner_up)
         return sweep, self.fit(state, max(width, self.frame.leading(TRUNCATION * error)))
 
@@ -194,6 +201,45 @@ def iterate(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, eno
     error = polish(work, state, enough)
     monitor.note("all values", error, 1.0)
     return error
+
+
+def wide_start(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -> Subspaces:
+    """The paper's own start, random points and a few LBG iterations, on the few leading values that tell means apart."""
+    width = frame.leading(TRUNCATION * float(frame.tail[0]))
+    data = np.ascontiguousarray(frame.coordinates[:, :width])
+    means = random_means(data, settings.clusters, np.random.default_rng(settings.seed))
+    labels = lbg(data, means, min(settings.iterations, LBG_ITERATIONS), monitor.workers)
+    return from_labels(labels, settings.clusters, width, 0)
+
+
+def iterate_wide(frame: GlobalFrame, settings: EncoderSettings, enough: float, monitor: Monitor) -> Subspaces:
+    """Section 4.2 for signals of many values and points, whose exact sweeps on all values would cost most of the time.
+
+    Measured (Buddha, 24 x 25, 8 vectors): sweeps among neighbours alone end 5 % higher than with one sweep among all
+    subspaces per number of vectors; and on the leading values that leave out a tenth of the error they end as low as on
+    all values.
+    """
+    state = wide_start(frame, settings, monitor)
+    work = Work.of(frame, state, settings, monitor)
+    error = work.fit(state, state.means.shape[1])
+    for vectors in range(settings.vectors + 1):
+        if vectors:
+            state.vectors[:] = vectors
+            state.resize(state.means.shape[1], vectors + SPARE)
+        for number in range(min(settings.iterations, WIDE_SWEEPS)):
+            sweep, error = work.sweep(state, error, number == SURVEY)
+            if (state.counts == 0).any() and rebalance(frame.coordinates[:, :state.means.shape[1]], state, None,
+                                                       monitor.workers):
+                error = work.fit(state, state.means.shape[1])
+            if sweep.changed == 0:
+                break
+        monitor.note(f"{vectors} vectors", error, (vectors + 1) / (settings.vectors + 2))
+        if error <= enough:
+            break
+    if vectors == settings.vectors and error > enough:
+        error = rearrange(work, state, error, sweep, settings.tolerance * BEFORE_EXACT)
+    monitor.note("rearranged", error, 1.0)
+    return state
 
 
 def polish(work: Work, state: Subspaces, enough: float) -> float:
