@@ -43,9 +43,9 @@ WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
 EXACT = 2.0
 # Most rounds of rearranging clusters.
 ROUNDS = 2
-# Of wide signals: sweeps for each number of vectors, which of them looks at all subspaces, and LBG iterations before
-# them.
-WIDE_SWEEPS, SURVEY, LBG_ITERATIONS = 4, 1, 6
+# Of wide signals: sweeps for each number of vectors but the last LAST, and for those, where they help most; after how
+# many the first and the next ones look at all subspaces; LBG iterations before all.
+FIRST_SWEEPS, LAST_SWEEPS, LAST, SURVEY, SURVEY_EVERY, LBG_ITERATIONS = 3, 6, 3, 1, 3, 6
 
 
 @dataclass
@@ -226,11 +226,16 @@ def iterate_wide(frame: GlobalFrame, settings: EncoderSettings, enough: float, m
         if vectors:
             state.vectors[:] = vectors
             state.resize(state.means.shape[1], vectors + SPARE)
-        for number in range(min(settings.iterations, WIDE_SWEEPS)):
-            sweep, error = work.sweep(state, error, number == SURVEY)
-            if (state.counts == 0).any() and rebalance(frame.coordinates[:, :state.means.shape[1]], state, None,
-                                                       monitor.workers):
-                error = work.fit(state, state.means.shape[1])
+        sweeps = FIRST_SWEEPS if vectors <= settings.vectors - LAST else LAST_SWEEPS
+        for number in range(min(settings.iterations, sweeps)):
+            survey = number % SURVEY_EVERY == SURVEY
+            sweep, error = work.sweep(state, error, survey)
+            # While more sweeps will mend what a move spoils, any that promises to help is made.
+            chosen = sweep if survey and 0 < vectors < settings.vectors and number == SURVEY else None
+            if chosen is not None or (state.counts == 0).any():
+                width = state.means.shape[1]
+                if rebalance(frame.coordinates[:, :width], state, chosen, monitor.workers):
+                    error = work.fit(state, width)
             if sweep.changed == 0:
                 break
         monitor.note(f"{vectors} vectors", error, (vectors + 1) / (settings.vectors + 2))

@@ -182,9 +182,9 @@ def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.i
     for cluster, points in zip(used, members, strict=True):
         workers.tick()
         fits.append(principal_components(frame.coordinates[points], int(vectors[cluster])))
-    scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:
+        scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
         kept = trim_vectors([fit[2] for fit in fits], counts, scatter, enough)
     most, values = int(kept.max()), frame.coordinates.shape[1]
     bases = np.zeros((len(fits), most + 1, values))
