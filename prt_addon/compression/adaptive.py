@@ -115,7 +115,7 @@ def _adapt_wide(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings,
         last = best[0]
         if error < last:
             best = error, state.labels, state.vectors
-        # A cluster of many vectors draws few points, for which more vectors are cheap: later rounds may raise the error.
+        # Clusters of many vectors keep few points, for which more vectors are cheap: later rounds may raise it.
         if error > last * (1 - settings.tolerance / 2):
             break
         if number < WIDE_ROUNDS - 1:

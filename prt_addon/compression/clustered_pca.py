@@ -204,7 +204,7 @@ def iterate(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, eno
 
 
 def wide_start(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -> Subspaces:
-    """The paper's own start, random points and a few LBG iterations, on the few leading values that tell means apart."""
+    """The paper's own start, random points and a few LBG iterations, on the leading values that tell means apart."""
     width = frame.leading(TRUNCATION * float(frame.tail[0]))
     data = np.ascontiguousarray(frame.coordinates[:, :width])
     means = random_means(data, settings.clusters, np.random.default_rng(settings.seed))
