@@ -43,6 +43,9 @@ WHILE_ADDING, BEFORE_EXACT = 10.0, 2.0
 EXACT = 2.0
 # Most rounds of rearranging clusters.
 ROUNDS = 2
+# Share of the points that a survey must have moved beyond their neighbours for the next one, the first with a number of
+# vectors or another with as many, to be worth its time.
+WORTH_THE_FIRST, WORTH_ANOTHER = 0.001, 0.005
 # Of wide signals: sweeps for each number of vectors but the last LAST, and for those, where they help most; after how
 # many the first and the next ones look at all subspaces; LBG iterations before all.
 FIRST_SWEEPS, LAST_SWEEPS, LAST, SURVEY, SURVEY_EVERY, LBG_ITERATIONS = 3, 6, 3, 1, 3, 6
@@ -56,6 +59,8 @@ class Work:
     settings: EncoderSettings
     monitor: Monitor
     neighbours: Neighbours
+    # Share of the points that the last survey moved to a subspace on no list of neighbours.
+    unseen: float = 1.0
 
     @staticmethod
     def of(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monitor: Monitor) -> Work:
@@ -74,7 +79,10 @@ class Work:
         width = state.means.shape[1]
         data, before = self.frame.coordinates[:, :width], state.labels
         if survey:
+            listed = np.zeros((len(state.means),) * 2, bool)
+            np.put_along_axis(listed, self.neighbours.lists(state), True, axis=1)
             sweep = reclassify_all(data, state, self.monitor.workers)
+            self.unseen = float(np.mean(~listed[before, state.labels]))
         else:
             sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers)
         self.neighbours.learn(before, state.labels, sweep.runner_up)
@@ -228,10 +236,11 @@ def iterate_wide(frame: GlobalFrame, settings: EncoderSettings, enough: float, m
             state.resize(state.means.shape[1], vectors + SPARE)
         sweeps = FIRST_SWEEPS if vectors <= settings.vectors - LAST else LAST_SWEEPS
         for number in range(min(settings.iterations, sweeps)):
-            survey = number % SURVEY_EVERY == SURVEY
+            survey = number % SURVEY_EVERY == SURVEY and work.unseen > (
+                WORTH_THE_FIRST if number == SURVEY else WORTH_ANOTHER)
             sweep, error = work.sweep(state, error, survey)
             # While more sweeps will mend what a move spoils, any that promises to help is made.
-            chosen = sweep if survey and 0 < vectors < settings.vectors and number == SURVEY else None
+            chosen = sweep if 0 < vectors < settings.vectors and number == SURVEY else None
             if chosen is not None or (state.counts == 0).any():
                 width = state.means.shape[1]
                 if rebalance(frame.coordinates[:, :width], state, chosen, monitor.workers):
