@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .clustered_pca import Work
 from .global_frame import GlobalFrame
 from .monitor import Monitor
 from .reclassify import reclassify
@@ -16,6 +17,9 @@ from .subspaces import SPARE, Subspaces, update
 ROUNDS = 10
 # Updates after vectors are added, so that power steps find the spectra that decide about them.
 SPECTRUM_STEPS = 2
+# Of signals whose exact sweeps on all values would cost most of the time: rounds, and which of them looks at all
+# subspaces.
+WIDE_ROUNDS, SURVEY_EVERY = 8, 4
 
 
 def distribute(gains: NDArray[np.float64], counts: NDArray[np.int64], budget: int) -> NDArray[np.int64]:
@@ -69,6 +73,8 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
     """
     most = settings.most_vectors
     budget = len(state.labels) * settings.vectors
+    if state.means.shape[1] < frame.coordinates.shape[1]:
+        return _adapt_wide(frame, state, settings, monitor, budget)
     data = frame.coordinates
     state.resize(data.shape[1], most + SPARE)
     for _ in range(SPECTRUM_STEPS):
@@ -87,5 +93,32 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
             break
         reclassify(data, state, monitor.workers)
         update(data, state, monitor.workers)
+    state.labels, state.vectors = best[1], best[2]
+    return True
+
+
+def _adapt_wide(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monitor: Monitor, budget: int) -> bool:
+    """`adapt` on the leading values that the state has, most sweeps among neighbours."""
+    most = settings.most_vectors
+    work = Work.of(frame, state, settings, monitor)
+    state.resize(state.means.shape[1], most + SPARE)
+    for _ in range(SPECTRUM_STEPS):
+        error = work.fit(state, state.means.shape[1])
+    best = error, state.labels, state.vectors
+    if not adaptation_pays(state.errors, state.counts, state.spread[:, :most], settings.vectors):
+        monitor.note("adaptive left out", error, 1.0)
+        return False
+    for number in range(WIDE_ROUNDS):
+        state.vectors = distribute(state.spread[:, :most], state.counts, budget)
+        error = state.error + float(frame.tail[state.means.shape[1]])
+        monitor.note("adaptive", error, (number + 1) / WIDE_ROUNDS)
+        last = best[0]
+        if error < last:
+            best = error, state.labels, state.vectors
+        # Clusters of many vectors keep few points, for which more vectors are cheap: later rounds may raise it.
+        if error > last * (1 - settings.tolerance / 2):
+            break
+        if number < WIDE_ROUNDS - 1:
+            work.sweep(state, error, number % SURVEY_EVERY == 0)
     state.labels, state.vectors = best[1], best[2]
     return True

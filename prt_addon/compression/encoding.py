@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..linear_algebra import multiply
 from .adaptive import adapt, trim_vectors
-from .clustered_pca import SEED_VECTORS, disturb, iterate, random_start, split_start, static_labels
+from .clustered_pca import SEED_VECTORS, disturb, iterate, iterate_wide, random_start, split_start, static_labels
 from .global_frame import GlobalFrame, global_frame
 from .monitor import Monitor, Progress
 from .pca import principal_components
@@ -28,6 +28,8 @@ UNSEEN, UNSEEN_WITHOUT_TARGET = 0.1, 1e-8
 START_BUDGET, MOST_STARTS = 1 << 22, 6
 # Random exchanges of clusters after the starts, for each of the random ones.
 TRIALS_PER_START = 4
+# Values from which on random starts and sweeps among all subspaces beat splits (measured at 100 and 400).
+WIDE_VALUES = 64
 CHUNK = 4096
 
 
@@ -141,6 +143,8 @@ def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, mo
         restarts = min(START_BUDGET // (frame.coordinates.size * settings.clusters), MOST_STARTS)
     if restarts == 0 or settings.target_error is not None:
         monitor.span(0.0, share)
+        if settings.target_error is None and _is_wide(frame):
+            return iterate_wide(frame, settings, enough, monitor)
         state = split_start(frame, settings, enough, monitor)
         iterate(frame, state, settings, enough, monitor)
         return state
@@ -161,6 +165,11 @@ def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, mo
     return best
 
 
+def _is_wide(frame: GlobalFrame) -> bool:
+    """Whether clusters are long in many directions, so that their eigenproblems are not solved outright."""
+    return frame.coordinates.shape[1] >= WIDE_VALUES
+
+
 def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64],
             enough: float | None, workers: Workers) -> Encoding:
     """Exact PCA of every cluster on all values, then back to the signal's own values.
@@ -173,9 +182,9 @@ def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.i
     for cluster, points in zip(used, members, strict=True):
         workers.tick()
         fits.append(principal_components(frame.coordinates[points], int(vectors[cluster])))
-    scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:
+        scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
         kept = trim_vectors([fit[2] for fit in fits], counts, scatter, enough)
     most, values = int(kept.max()), frame.coordinates.shape[1]
     bases = np.zeros((len(fits), most + 1, values))

@@ -165,16 +165,33 @@ def _squared(centred: Single, planes: Single, offsets: Single, lengths: Single) 
 def nearest_of_all(data: Single, state: Subspaces, workers: Workers = SERIAL) -> NDArray[np.int32]:
     """The nearest of all subspaces with points to every point of data (p, d), up to rounding against the size of the
     whole signal: (p,)."""
-    filled = np.flatnonzero(state.counts)
+    return _all_distances(data, state, workers).labels
+
+
+def reclassify_all(data: Single, state: Subspaces, workers: Workers = SERIAL) -> Sweep:
+    """Give every point of data (p, d) to the nearest of all subspaces with points, in place.
+
+    One large product a block: where the values are few, this costs some five sweeps among neighbours and finds
+    what they cannot see.
+    """
+    found = _all_distances(data, state, workers)
+    changed = int((found.labels != state.labels).sum())
+    state.labels = found.labels
+    return Sweep(changed, found.runner_up, np.bincount(found.labels, found.rise, len(state.means)))
+
+
+def _all_distances(data: Single, state: Subspaces, workers: Workers) -> _Found:
+    filled = np.flatnonzero(state.counts).astype(np.int32)
     means, rows = state.means[filled], state.vector_major()[:, filled]
-    labels = np.empty(len(data), np.int32)
+    found = _Found(np.empty(len(data), np.int32), np.empty(len(data), np.int32), np.empty(len(data), np.float32))
 
     def classify(start: int) -> None:
         part = slice(start, start + ROWS)
-        labels[part] = filled[_two_nearest(data[part], means, rows)[0]]
+        best, second, found.rise[part] = _two_nearest(data[part], means, rows)
+        found.labels[part], found.runner_up[part] = filled[best], filled[second]
 
     workers.run(classify, range(0, len(data), ROWS))
-    return labels
+    return found
 
 
 def _neighbouring(means: Single, clusters: NDArray[np.intp]) -> list[NDArray[np.intp]]:

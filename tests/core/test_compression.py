@@ -22,7 +22,7 @@ from prt_addon.compression.clustered_pca import disturb, iterate
 from prt_addon.compression.coherence import overdraw
 from prt_addon.compression.encoding import encode, pca, vector_quantization
 from prt_addon.compression.monitor import Monitor
-from prt_addon.compression.neighbours import Neighbours, _two_least, reclassify_near
+from prt_addon.compression.neighbours import Neighbours, _two_least, reclassify_all, reclassify_near
 from prt_addon.compression.pca import principal_components
 from prt_addon.compression.reclassify import reclassify
 from prt_addon.compression.settings import EncoderSettings
@@ -456,3 +456,35 @@ def test_two_least_equals_sorting() -> None:
     assert (best == rows[0])[apart[0]].all() and (second == rows[1])[apart[0] & apart[1]].all()
     np.testing.assert_allclose(rise, order[1] - order[0], atol=2e-5 * order[1].max())
     assert (_two_least(squared[:1].copy())[0] == 0).all()
+
+
+def test_classification_among_all_equals_brute_force() -> None:
+    signal = surface_signal(2000, 70)
+    state = from_labels(np.random.default_rng(1).integers(0, 30, 2000).astype(np.int32), 31, 70, 2)  # the last empty
+    for _ in range(3):
+        update(signal, state)
+    squared = brute_squared_distances(signal, list(state.means[:30]), list(state.bases[:30, :2]))
+    sweep = reclassify_all(signal, state)
+    ordered = np.sort(squared, axis=1)
+    np.testing.assert_allclose(squared[np.arange(2000), state.labels], ordered[:, 0], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(squared[np.arange(2000), sweep.runner_up], ordered[:, 1], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_wide_signals_are_not_worse_than_the_papers_procedure(seed: int) -> None:
+    signal = surface_signal(1000, 80, seed)
+    ours = encode(signal, quick(12, 3)).squared_error
+    assert ours <= 1.02 * min(papers_procedure(signal, 12, 3, trial, 10) for trial in range(2))
+
+
+@pytest.mark.parametrize("method", ["iterative", "adaptive"])
+def test_wide_signals_do_not_depend_on_threads_and_may_be_degenerate(method: str) -> None:
+    signal = surface_signal(3000, 80)
+    one, two = (encode(signal, quick(24, 3, method, threads=threads)) for threads in (1, 2))
+    np.testing.assert_array_equal(one.cluster, two.cluster)
+    np.testing.assert_array_equal(one.bases, two.bases)
+    difference = one.decode().astype(float) - signal
+    assert one.squared_error == pytest.approx(np.square(difference).sum(), rel=1e-3)
+    for few in (signal[:10], np.repeat(signal[:3], 20, axis=0), np.ones((50, 80), np.float32)):
+        found = encode(few, quick(24, 3, method))
+        assert np.isfinite(found.bases).all() and found.squared_error <= 1e-6 * np.square(few).sum()

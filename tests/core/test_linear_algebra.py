@@ -48,9 +48,9 @@ def test_many_eigenpairs(available, monkeypatch) -> None:
     np.testing.assert_allclose(rows @ columns, np.broadcast_to(np.eye(9), (6, 9, 9)), atol=1e-12)
 
 
+@pytest.mark.skipif(not unlocked_blas.available, reason="this scipy does not export its routines: the fall-back works")
 def test_large_products_let_other_threads_run() -> None:
     """The reason for the module: this scipy exports its routines, and while one works, Python goes on."""
-    assert unlocked_blas.available
     matrix = np.random.default_rng(0).normal(size=(1500, 1500)).astype(np.float32)
     thread = threading.Thread(target=lambda: multiply(matrix, matrix))
     thread.start()
@@ -58,3 +58,30 @@ def test_large_products_let_other_threads_run() -> None:
     while thread.is_alive():
         steps += 1
     assert steps > 20_000
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_fall_back_gives_the_same_answers(kind, monkeypatch) -> None:
+    """A scipy that exports no routines: large products, alone and added to an array, and eigenpairs."""
+    generator = np.random.default_rng(2)
+    a, b = generator.normal(size=(300, 120)).astype(kind), generator.normal(size=(120, 200)).astype(kind)
+    roots = generator.normal(size=(5, 8, 8))
+
+    def answers() -> list[np.ndarray]:
+        out = np.ones((300, 200), kind)
+        multiply(a, b, out, accumulate=True)
+        values, rows = many_symmetric_eigenpairs(roots @ roots.transpose(0, 2, 1))
+        return [multiply(a, b), out, values, np.abs(rows)]
+
+    with monkeypatch.context() as patch:  # the routine itself must not be touched where it is said to be absent
+        patch.setattr(unlocked_blas, "available", False)
+        patch.setattr(unlocked_blas, "gemm", None)
+        patch.setattr(unlocked_blas, "eigenpairs_in_place", None)
+        found = answers()
+    tolerance = 1e-4 if kind == np.float32 else 1e-11
+    outside = [a.astype(float) @ b, 1 + a.astype(float) @ b,
+               np.linalg.eigvalsh(roots @ roots.transpose(0, 2, 1))[:, ::-1]]
+    for one, other in zip(found, outside, strict=False):
+        np.testing.assert_allclose(one, other, atol=tolerance)
+    for one, other in zip(found, answers(), strict=True):
+        np.testing.assert_allclose(one, other, atol=tolerance)
