@@ -57,11 +57,13 @@ class Tracer:
         """World positions (n, 3) as Embree sees them."""
         return np.ascontiguousarray((points - self._centre) / self.diagonal, np.float32)
 
-    def occluded(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether rays hit anything. origins: (n, 3) in tracing space; directions: (n, 3) or one for all (1, 3)."""
+    def occluded(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                 reach: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
+        """Whether rays hit anything. origins: (n, 3) in tracing space; directions: (n, 3) or one for all (1, 3); reach:
+        (n,), how far each ray goes, in lengths of its direction (None: for ever)."""
         if self._scene is None or not len(origins):
             return np.zeros(len(origins), bool)
-        return self._scene.run(origins, directions, query="OCCLUDED") >= 0
+        return self._scene.run(origins, directions, dists=reach, query="OCCLUDED") >= 0
 
     def nearest(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
         """Nearest hits of rays; arguments as for `occluded`."""
