@@ -55,6 +55,8 @@ class ObjectDrawing:
         self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
         self._colours: gpu.types.GPUTexture | None = None
         self._plain_batch: gpu.types.GPUBatch | None = None  # for colours, one vertex per point
+        self._direct: gpu.types.GPUTexture | None = None
+        self._direct_values: NDArray[np.float32] | None = None
 
     def relight(self, constants: NDArray[np.float32]) -> None:
         """Compute every point's exit radiance from per-cluster constants (clusters, vectors + 1, rows, 3)."""
@@ -81,6 +83,16 @@ class ObjectDrawing:
         if self.data.functions and self._plain_batch is None:
             self._plain_batch = _make_batch(plain_surface(self.data))
 
+    def add_direct(self, values: NDArray[np.float32] | None) -> None:
+        """Direct light (points, rows, 3), for unit albedo in row 0, to add from now on; None for none."""
+        if values is self._direct_values:
+            return
+        expected = (self.data.points, self.data.rows, 3)
+        if values is not None and values.shape != expected:
+            raise ValueError(f"direct light has shape {values.shape}, the drawn data needs {expected}")
+        self._direct_values = values
+        self._direct = None if values is None else make_texture(texture_values(values.reshape(-1, 3)))
+
     def exit_radiances(self) -> NDArray[np.float32]:
         """The exit radiances on the GPU for unit albedo, (points, rows, 3). Waits for the GPU: for tests and export."""
         count = self.data.points * self.data.rows
@@ -94,7 +106,11 @@ class ObjectDrawing:
         depends_on_view = bool(self.data.functions) and self._colours is None
         program = programs.view_surface(self.data.functions) if depends_on_view else programs.surface()
         program.bind()
-        program.uniform_sampler("exit_values", self._exit if self._colours is None else self._colours)
+        exit_values = self._exit if self._colours is None else self._colours
+        direct = self._direct if self._colours is None else None
+        program.uniform_sampler("exit_values", exit_values)
+        program.uniform_sampler("direct_values", exit_values if direct is None else direct)
+        program.uniform_float("direct_share", 0.0 if direct is None else 1.0)
         program.uniform_float("transform", Matrix(transform.tolist()))
         if depends_on_view and programs.sees_viewer(self.data.functions):
             program.uniform_float("viewer", viewer_of(transform).tolist())
@@ -161,10 +177,11 @@ class DrawingCache:
         if self._lights.get(item.key) != light:
             if item.heat is None:
                 coefficients = matching_light(item.light, drawing.data.columns)
-                drawing.relight(cluster_constants(item.baked.bases, coefficients))
+                drawing.relight(cluster_constants(item.baked.bases, coefficients, item.baked.cluster_zone))
             else:
                 drawing.show_colours(heat_colours(item.heat))
             self._lights[item.key] = light
+        drawing.add_direct(item.direct)
         return drawing
 
     def keep_only(self, keys: set[Hashable]) -> None:

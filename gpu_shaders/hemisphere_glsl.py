@@ -22,6 +22,13 @@ def fetch_rows(functions: tuple[int, ...]) -> str:
     return "\n".join(["void fetch_rows(int first_texel)", "{", *lines, "}", ""])
 
 
+def add_direct_rows(functions: tuple[int, ...]) -> str:
+    """`void add_direct_rows(int first_texel)` of the vertex stage: the direct light of lamps on top."""
+    lines = [f"  {name} += texelFetch(direct_values, texel(first_texel + {index + 1}), 0).rgb;"
+             for index, name in enumerate(row_names(functions))]
+    return "\n".join(["void add_direct_rows(int first_texel)", "{", *lines, "}", ""])
+
+
 def turns_with_frames(functions: tuple[int, ...]) -> bool:
     """Whether the rows can be turned about the normal: with every function of azimuth m the set has its twin -m."""
     return all(_twin(index) in functions for index in functions)

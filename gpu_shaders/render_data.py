@@ -35,8 +35,11 @@ class DrawItem:
 
     key: changes when `baked` does (`transfer_signature(baked)`, or anything hashable and cheaper that does).
     matrix: (4, 4), from world space at bake time to world space now: current matrix_world @ inverse(matrix at bake).
-    light: (columns, 3), coefficients in the lighting basis of the bake; more columns than the bake has are left out
+    light: (columns, 3), coefficients in the lighting basis of the bake, or (zones, columns, 3) where a light cloud takes
+        part (`relighting.scene_light.joined_light`); more columns than a bake for distant light has are left out
         (spherical harmonics of a higher order).
+    direct: (points, rows, 3) float32, what lamps add to the exit radiance: their direct light, which no bake holds.
+        Never changed in place: another array means other light.
     exposure: factor on the radiance. stale: drawn dimmed, because the object was edited after its bake.
     heat: (points,) in 0..1 shown as false colours in place of the radiance, or None.
     """
@@ -48,6 +51,7 @@ class DrawItem:
     exposure: float = 1.0
     stale: bool = False
     heat: NDArray[np.floating] | None = None
+    direct: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -236,15 +240,18 @@ def light_signature(item: DrawItem) -> Hashable:
 
 
 def matching_light(light: ArrayLike, columns: int) -> NDArray[np.float32]:
-    """The first `columns` coefficients of a light (n, 3). Raises BadScene when it has fewer."""
+    """The first `columns` coefficients of a light (n, 3), or a light of zones (zones, columns, 3) as it is. Raises
+    BadScene when it has fewer."""
     coefficients = np.asarray(light, np.float32)
-    if coefficients.ndim != 2 or coefficients.shape[1] != 3 or len(coefficients) < columns:
+    fits = coefficients.shape[1:] == (columns, 3) if coefficients.ndim == 3 else (
+        coefficients.ndim == 2 and coefficients.shape[1] == 3 and len(coefficients) >= columns)
+    if not fits:
         raise BadScene(
             "the light",
             f"it has shape {coefficients.shape}, the bake expects ({columns}, 3)",
             "Bake the object again with the current settings",
         )
-    return coefficients[:columns]
+    return coefficients if coefficients.ndim == 3 else coefficients[:columns]
 
 
 def heat_colours(heat: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -8,6 +8,10 @@ void main()
   int first_texel = int(receiver_and_turn.x + 0.5) * ROWS;
   diffuse_radiance = texelFetch(exit_values, texel(first_texel), 0).rgb;
   fetch_rows(first_texel);
+  if (direct_share > 0.0) {
+    diffuse_radiance += texelFetch(direct_values, texel(first_texel), 0).rgb;
+    add_direct_rows(first_texel);
+  }
   if (receiver_and_turn.y != 0.0) {
     turn_rows(receiver_and_turn.y);
   }

@@ -17,12 +17,15 @@ from typing import Any
 import bpy
 
 from ..prt_addon.baking import job as jobs
+from ..prt_addon.baking.local_lights import fit_to_lamps
 from ..prt_addon.baking.plan import make_plan
 from ..prt_addon.baking.process import BakeProcess
 from ..prt_addon.baking.recipe import BakeResult
 from ..prt_addon.baking.settings import BakeSettings
 from ..prt_addon.blender.fingerprint import fingerprint, surroundings
+from ..prt_addon.blender.light_region import light_regions
 from ..prt_addon.blender.lights import reference_light
+from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
 from ..prt_addon.blender.visibility import find_objects
@@ -103,6 +106,8 @@ class BakeSession:
         """
         started = time.monotonic()
         scene = read_scene(depsgraph, settings, targets)
+        settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
+        scene = replace(scene, warnings=(*scene.warnings, *left_out))
         names = [o.name for o in scene.objects if o.is_target]
         targets_found = find_objects(names, depsgraph.scene)
         _check_storable(targets_found)
@@ -110,7 +115,8 @@ class BakeSession:
         geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
         folder = jobs_folder()
         _drop_forgotten(folder)
-        job = jobs.write_job(folder, scene, settings, reference_light(depsgraph), geometry)
+        regions = light_regions(depsgraph, settings.cloud_region) if settings.local_light else None
+        job = jobs.write_job(folder, scene, settings, reference_light(depsgraph), geometry, regions)
         process = BakeProcess([sys.executable, *bpy.app.python_args], job)
         process.start()
         return BakeSession(job, process, started, depsgraph.scene.name, digests, surroundings(depsgraph))

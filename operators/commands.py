@@ -113,7 +113,8 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--input", type=Path, required=True, metavar="FILE.blend")
     parser.add_argument("--objects", type=_names, default=None, metavar="A,B", help="default: all visible meshes")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="standard")
-    parser.add_argument("--lighting", choices=("environment", "local"), default="environment")
+    parser.add_argument("--lighting", type=_lighting, default=None, metavar="environment,local",
+                        help="what will light the scene: World and Suns, lamps that move, or both")
     parser.add_argument("--set", type=_assignment, action="append", default=[], dest="overrides", metavar="NAME=VALUE",
                         help="a single setting, in place of the preset's; may be repeated")
 
@@ -143,7 +144,7 @@ def _add_relight(group: argparse._SubParsersAction) -> None:
     parser.add_argument("--input", type=Path, required=True, metavar="FILE.blend")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.npz")
     _add_light_options(parser)
-    parser.add_argument("--use-scene-lights", action="store_true", help="add the scene's Suns to the environment")
+    parser.add_argument("--use-scene-lights", action="store_true", help="add the scene's Suns to the environment, and its lamps where they were baked for")
 
 
 def _add_preview(group: argparse._SubParsersAction) -> None:
@@ -171,6 +172,14 @@ def _names(text: str) -> list[str]:
     if not names:
         raise argparse.ArgumentTypeError("no object names given")
     return names
+
+
+def _lighting(text: str) -> str:
+    kinds = {kind.strip() for kind in text.split(",")}
+    chosen = [kind for kind in ("environment", "local") if kind in kinds]
+    if len(chosen) != len(kinds):
+        raise argparse.ArgumentTypeError(f"{text!r} is not environment, local or environment,local")
+    return ",".join(chosen)
 
 
 def _assignment(text: str) -> tuple[str, str]:

@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from ..gpu_shaders import viewport
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
-from ..prt_addon.basis.spherical_harmonics import order_of, rotate
+from ..prt_addon.basis.spherical_harmonics import rotate
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
+from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
+from .scene_lamps import SceneLamps, lamps_signature
 
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
@@ -41,6 +43,7 @@ class Shown:
     baked: BakedTransfer
     key: Hashable
     stale: bool = False
+    direct: NDArray[np.float32] | None = None
 
 
 @dataclass
@@ -49,6 +52,9 @@ class Live:
 
     shown: dict[str, Shown] = field(default_factory=dict)
     light: NDArray[np.float64] | None = None
+    lamps: SceneLamps = field(default_factory=SceneLamps)
+    lamps_signature: Hashable = None
+    lamps_time: float = 0.0
     signature: Hashable = None
     rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
     light_seconds: float = 0.0
@@ -90,7 +96,7 @@ def disable() -> None:
 
 def draw_list() -> list[DrawItem]:
     """What one region draws now: called on every redraw, so it only looks things up."""
-    if _live.light is None:
+    if _live.signature is None:
         return []
     space, exposure = bpy.context.space_data, 2.0 ** bpy.context.scene.prt.exposure
     items = []
@@ -99,7 +105,8 @@ def draw_list() -> list[DrawItem]:
         if found is None or found.mode != "OBJECT" or not found.visible_in_viewport_get(space):
             continue
         moved = transform_since_bake(found, shown.baked.header)
-        items.append(DrawItem(shown.key, shown.baked, moved, _light_in(moved), exposure, shown.stale))
+        light = joined_light(shown.baked.lighting_basis, _light_in(moved), _live.lamps.cloud_light(shown.baked))
+        items.append(DrawItem(shown.key, shown.baked, moved, light, exposure, shown.stale, direct=shown.direct))
     return items
 
 
@@ -112,8 +119,10 @@ def shows_everything() -> bool:
                for found in bpy.context.view_layer.objects)
 
 
-def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
+def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Distant light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
+    if _live.light is None:
+        return None
     scale = np.sqrt((moved[:3, :3] ** 2).sum(axis=0))
     turn = moved[:3, :3] / np.where(scale > 0.0, scale, 1.0)
     if np.abs(turn - np.eye(3)).max() < 1e-5 or np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:  # small
@@ -148,6 +157,7 @@ def _read_bakes() -> None:
 def _read_stale() -> None:
     """Compare the baked objects with what they were baked from."""
     _live.stale_dirty = False
+    _live.lamps.forget_geometry()
     started = time.perf_counter()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
@@ -164,17 +174,41 @@ def _read_stale() -> None:
 def _read_light() -> None:
     """Evaluate the scene's light when it changed; the viewport redraws only then."""
     _live.light_dirty = False
-    order = max((order_of(shown.baked.columns) for shown in _live.shown.values()), default=0)
-    if order == 0:
-        _live.light = None
+    if not _live.shown:
+        _live.signature = _live.light = None
         return
-    started = time.perf_counter()
-    light = light_coefficients(bpy.context.scene, bpy.context.evaluated_depsgraph_get(), order,
-                               window=bpy.context.scene.prt.window)
+    started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
+    warnings: list[str] = []
+    order = max(shown.baked.lighting_basis.order for shown in _live.shown.values())
+    distant, signature = None, None
+    if order:
+        name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
+        found = light_coefficients(bpy.context.scene, depsgraph, order, window=bpy.context.scene.prt.window,
+                                   name_lamps=name_lamps)
+        distant, signature = found.coefficients, found.signature
+        warnings += found.warnings
+    _read_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
-    assign(session(), preview_message="\n".join(light.warnings))
-    if (order, light.signature) != _live.signature:
-        _live.signature, _live.light, _live.rotated = (order, light.signature), light.coefficients, {}
+    assign(session(), preview_message="\n".join(dict.fromkeys(warnings)))
+    if (order, signature) != _live.signature:
+        _live.signature, _live.light, _live.rotated = (order, signature), distant, {}
+        viewport.redraw()
+
+
+def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
+    """Let the lamps' light follow; while some of it still fades, ask for the next step."""
+    now, baked = time.perf_counter(), {name: shown.baked for name, shown in _live.shown.items()}
+    lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time)
+    _live.lamps_time = now
+    signature = lamps_signature(lamps)
+    if signature != _live.lamps_signature or any(
+            shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
+        _live.lamps_signature = signature
+        for name, shown in _live.shown.items():
+            shown.direct = _live.lamps.direct(name, shown.baked, lamps)
+        viewport.redraw()
+    if not _live.lamps.settled:
+        _live.light_dirty = True
         viewport.redraw()
 
 
@@ -183,11 +217,11 @@ def _schedule(wait: float) -> None:
         bpy.app.timers.register(_catch_up, first_interval=wait, persistent=True)
 
 
-def _catch_up() -> None:
-    """Do what the handlers asked for."""
+def _catch_up() -> float | None:
+    """Do what the handlers asked for; the seconds until more is to be done."""
     windows = bpy.context.window_manager.windows
     if not windows:
-        return
+        return None
     _live.working = True
     assign(session(), preview=viewport.is_enabled())  # loading a file with its windows starts a new session
     try:
@@ -203,8 +237,11 @@ def _catch_up() -> None:
     finally:
         _live.working = False
     viewport.redraw()
+    if _live.light_dirty and session().preview:  # light that fades
+        return max(SHORTEST_WAIT, _live.light_seconds)
     if not bpy.app.timers.is_registered(_note_viewport):
         bpy.app.timers.register(_note_viewport, first_interval=NOTE_WAIT, persistent=True)
+    return None
 
 
 def _note_viewport() -> None:

@@ -12,26 +12,29 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..prt_addon.baking.process import raise_error
 from ..prt_addon.baking.settings import BakeSettings, make_settings
-from ..prt_addon.basis.spherical_harmonics import order_of
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import Light, environment_picture, light_coefficients
+from ..prt_addon.blender.lights import environment_picture, light_coefficients
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import BadArguments, BadScene, StorageError
 from ..prt_addon.relighting.exit_radiance import view_radiance
+from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.files import save_arrays, save_json, write_atomically
 from .bake_session import BakeSession, analyze_scene
 from .job_mixin import progress_text
+from .scene_lamps import SceneLamps
 
 PROGRESS_SECONDS = 1.0  # between two lines of progress of one stage
 
@@ -73,8 +76,8 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
     _check_output(arguments.output, (".npz",), arguments.input)
     scene = _open(arguments.input)
     baked = _read_all(scene, arguments.input)
-    light = _light(scene, baked, arguments, arguments.use_scene_lights)
-    radiances = [view_radiance(b, light.coefficients[: b.columns], b.normals) for b in baked.values()]
+    lit = _lit(scene, baked, arguments, arguments.use_scene_lights)
+    radiances = [view_radiance(b, lit.light[name], b.normals, lit.direct[name]) for name, b in baked.items()]
     save_arrays(arguments.output, {
         "radiance": np.concatenate(radiances).astype(np.float32),
         "position": np.concatenate([b.positions for b in baked.values()]),
@@ -88,22 +91,24 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
 def preview(arguments: argparse.Namespace) -> Iterator[str]:
     """The path written: the active camera's view, through the viewport's shaders."""
     from ..gpu_shaders import offscreen  # a machine without a graphics driver has all other verbs
+    from ..gpu_shaders.render_data import DrawItem
 
     _check_output(arguments.output, (".png",), arguments.input)
     scene = _open(arguments.input)
     baked = _read_all(scene, arguments.input)
-    light = _light(scene, baked, arguments, use_scene_lights=True)
+    lit = _lit(scene, baked, arguments, use_scene_lights=True)
     percentage = scene.render.resolution_percentage / 100.0
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
                                        max(1, round(scene.render.resolution_y * percentage)))
-    placed = [(b, np.eye(4)) for b in baked.values()]  # small: a bake that was moved is stale and refused
+    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name])  # small: what moved is refused
+             for name, b in baked.items()]
     background = None
     if not scene.render.film_transparent:
         sky, rotation = environment_picture(scene, bpy.context.evaluated_depsgraph_get(), arguments.environment,
                                             arguments.rotate)
         sample = offscreen.environment_sampler(sky, rotation)
         background = offscreen.camera_background(scene, sample, width, height)
-    picture = offscreen.draw_camera(scene, placed, light.coefficients, width, height, background)
+    picture = offscreen.draw_items(scene, items, width, height, background)
     offscreen.write_png(arguments.output, picture, scene)
     yield str(arguments.output)
 
@@ -161,10 +166,8 @@ ARRAYS = {
 
 
 def _settings(arguments: argparse.Namespace) -> BakeSettings:
-    if arguments.lighting == "local":
-        raise BadArguments("--lighting local", "light clouds for local lights are not part of this version",
-                           "Use --lighting environment, which covers the World and Suns")
-    return make_settings(arguments.preset, dict(arguments.overrides))
+    chosen = {} if arguments.lighting is None else {"lighting": arguments.lighting}
+    return make_settings(arguments.preset, chosen | dict(arguments.overrides))
 
 
 def _open(path: Path) -> bpy.types.Scene:
@@ -235,17 +238,33 @@ def _read_all(scene: bpy.types.Scene, path: Path) -> dict[str, BakedTransfer]:
     return found
 
 
-def _light(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: argparse.Namespace,
-           use_scene_lights: bool) -> Light:
+@dataclass(frozen=True)
+class _Lit:
+    """By name of the baked object: light in its columns, and direct light of lamps (None for none)."""
+
+    light: dict[str, NDArray[np.float32]]
+    direct: dict[str, NDArray[np.float32] | None]
+
+
+def _lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: argparse.Namespace,
+         use_scene_lights: bool) -> _Lit:
     """The light that the arguments ask for, with its warnings on stderr."""
     if not math.isfinite(arguments.rotate):
         raise BadArguments("--rotate", f"{arguments.rotate} is no angle", "Give degrees")
-    order = max(order_of(b.columns) for b in baked.values())
-    light = light_coefficients(scene, bpy.context.evaluated_depsgraph_get(), order, arguments.environment,
-                               arguments.rotate, use_scene_lights, arguments.window)
-    for warning in light.warnings:
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    order = max(b.lighting_basis.order for b in baked.values())
+    distant, warnings = None, []
+    if order:
+        found = light_coefficients(scene, depsgraph, order, arguments.environment, arguments.rotate, use_scene_lights,
+                                   arguments.window, all(b.cloud is None for b in baked.values()))
+        distant, warnings = found.coefficients, list(found.warnings)
+    scene_lamps = SceneLamps()
+    lamps = scene_lamps.step(baked, depsgraph, warnings) if use_scene_lights else []
+    for warning in dict.fromkeys(warnings):
         print(f"prt: warning: {warning}", file=sys.stderr, flush=True)
-    return light
+    local = {name: scene_lamps.cloud_light(b) if lamps else None for name, b in baked.items()}
+    return _Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
+                {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()})
 
 
 def _file_name(name: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The error budget of a bake: where the difference from the truth comes from, measured at random receivers.
+"""The error budget of diffuse light: where the difference from the truth comes from, measured at random receivers.
 
 sampling: finite directions and gather rays, at the bake's own order of lighting; basis: light detail above that order;
 compression: clustered PCA; total: what is drawn against the full light. Each is a relative RMS of exit radiance over
@@ -24,16 +24,20 @@ from ..transport.path_reference import DistantSuns, reference_radiance
 from ..transport.receiver_set import ReceiverSet
 
 RESAMPLES = 400
+# Receivers of one object below which its own error is not told: their interval would span everything.
+FEWEST_RECEIVERS = 6
 
 
 @dataclass(frozen=True)
 class BakedSample:
     """What the bake says at r random receivers, all float64: transfer (r, columns, channels) before and after
-    compression; keys: which receivers."""
+    compression; keys: which receivers; objects: (r,) number of the object that each belongs to, names: of objects."""
 
     keys: NDArray[np.int64]
     transfer: NDArray[np.float64]
     compressed: NDArray[np.float64]
+    objects: NDArray[np.int64] | None = None
+    names: tuple[str, ...] = ()
 
 
 def choose_receivers(candidates: NDArray[np.int64], count: int, seed: int) -> NDArray[np.int64]:
@@ -64,12 +68,16 @@ def error_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
     baked = _lit(sample.transfer[place], coefficients)
     drawn = _lit(sample.compressed[place], coefficients)
     pair = (banded[0], banded[1])
-    return {
+    found = {
         "sampling": _entry(baked, baked, pair, rays, seed),
         "basis": _difference_entry(banded, full, rays, seed),
         "compression": _entry(drawn, drawn, (baked, baked), 0, seed),
         "total": _entry(drawn, drawn, (full[0], full[1]), rays, seed),
     }
+    if sample.objects is not None:
+        squared, power = _squares(drawn, drawn, (full[0], full[1]))
+        found["total"]["objects"] = by_object(squared, power, sample.objects[place], sample.names, seed)
+    return found
 
 
 def _lit(transfer: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -80,23 +88,41 @@ def _lit(transfer: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[n
 def _entry(first: NDArray[np.float64], second: NDArray[np.float64], truth: tuple[NDArray[np.float64], ...], rays: int,
            seed: int) -> dict[str, Any]:
     """Relative RMS of (first - truth) with its interval, from two independent estimates of the truth."""
-    squared = np.sum((first - truth[0]) * (second - truth[1]), axis=1)
-    return _summary(squared, np.sum(truth[0] * truth[1], axis=1), rays, seed)
+    return summary(*_squares(first, second, truth), rays, seed)
+
+
+def _squares(first: NDArray[np.float64], second: NDArray[np.float64], truth: tuple[NDArray[np.float64], ...],
+             ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Squared error and power (r,) of each receiver, without the truth's own noise."""
+    return np.sum((first - truth[0]) * (second - truth[1]), axis=1), np.sum(truth[0] * truth[1], axis=1)
 
 
 def _difference_entry(banded: NDArray[np.float64], full: NDArray[np.float64], rays: int, seed: int) -> dict[str, Any]:
     """As `_entry`, for two lightings seen along the same paths, whose noise is largely shared."""
     difference = banded - full
-    return _summary(np.sum(difference[0] * difference[1], axis=1), np.sum(full[0] * full[1], axis=1), rays, seed)
+    return summary(np.sum(difference[0] * difference[1], axis=1), np.sum(full[0] * full[1], axis=1), rays, seed)
 
 
-def _summary(squared: NDArray[np.float64], power: NDArray[np.float64], rays: int, seed: int) -> dict[str, Any]:
+def summary(squared: NDArray[np.float64], power: NDArray[np.float64], rays: int, seed: int) -> dict[str, Any]:
     """{"relative_rms", "interval" (95 %), "receivers", "reference_rays"} of per-receiver squared errors and powers."""
     generator = np.random.Generator(np.random.PCG64([seed, 78]))
     picks = generator.integers(0, len(squared), (RESAMPLES, len(squared)))
     low, high = np.percentile([_relative(squared[p], power[p]) for p in picks], (2.5, 97.5))
     return {"relative_rms": _relative(squared, power), "interval": [float(low), float(high)],
             "receivers": len(squared), "reference_rays": int(rays)}
+
+
+def by_object(squared: NDArray[np.float64], power: NDArray[np.float64], objects: NDArray[np.int64],
+              names: tuple[str, ...], seed: int) -> dict[str, dict[str, Any]]:
+    """{name: {"relative_rms", "interval", "receivers"}} of objects (r,) with enough receivers to say something."""
+    found = {}
+    for number in np.unique(objects):
+        mine = objects == number
+        if mine.sum() >= FEWEST_RECEIVERS:
+            entry = summary(squared[mine], power[mine], 0, seed)
+            del entry["reference_rays"]  # shared by all
+            found[names[number]] = entry
+    return found
 
 
 def _relative(squared: NDArray[np.float64], power: NDArray[np.float64]) -> float:

@@ -14,19 +14,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import StorageError
 from ..lighting.reference_light import ReferenceLight
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..scene.surface_material import SurfaceMaterial
-from ..storage.container import BakedTransfer, check_header
+from ..storage.container import BakedTransfer, check_header, flatten_cloud, read_cloud
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
 # Raised whenever the same input would give other numbers, so that old stages are not mixed with new code.
-JOB_SCHEMA = 2
+JOB_SCHEMA = 3
 SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
 _SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents")
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
@@ -34,12 +35,13 @@ _CONTAINER_EXTRA = ("tangents",)  # None where the transfer needs none
 
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
-              digests: dict[str, str] | None = None) -> Path:
+              digests: dict[str, str] | None = None, regions: NDArray[np.float64] | None = None) -> Path:
     """Write the input of a bake into its folder below `root` and return the folder; finished stages there stay.
 
-    digests: of the geometry by object name, kept in the headers. Raises StorageError where `root` can't be written.
+    digests: of the geometry by object name, kept in the headers. regions: of local lights, see `bake`. Raises StorageError where `root` can't be written.
     """
     arrays = {name: getattr(scene, name) for name in _SCENE_ARRAYS}
+    arrays["regions"] = np.empty((0, 4, 4)) if regions is None else regions
     header = {
         "schema": JOB_SCHEMA,
         "objects": [_object_header(o) for o in scene.objects],
@@ -72,7 +74,8 @@ def _object_header(scene_object: SceneObject) -> dict[str, Any]:
     return entry
 
 
-def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | None, dict[str, str]]:
+def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | None, dict[str, str],
+                                    NDArray[np.float64]]:
     """The input written by `write_job`. Raises StorageError."""
     arrays, header = load_arrays(folder / SCENE_FILE)
     objects = tuple(
@@ -86,7 +89,7 @@ def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | No
     if header["light"] is not None:
         stored = {name[len("light_"):]: value for name, value in arrays.items() if name.startswith("light_")}
         light = ReferenceLight.from_arrays(stored, header["light"])
-    return scene, BakeSettings(**header["settings"]), light, header["geometry_digests"]
+    return scene, BakeSettings(**header["settings"]), light, header["geometry_digests"], arrays["regions"]
 
 
 def _material(entry: dict[str, Any]) -> SurfaceMaterial:
@@ -99,10 +102,12 @@ def run_job(folder: Path) -> Generator[Progress]:
     """Bake a job, resuming after its finished stages, and leave the result in its folder."""
     if intact(folder / RESULT_FILE) is not None:
         return
-    scene, settings, light, digests = read_job(folder)
-    result = yield from bake(scene, settings, folder, light, digests)
+    scene, settings, light, digests, regions = read_job(folder)
+    result = yield from bake(scene, settings, folder, light, digests, regions)
     arrays = {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
               for name in _CONTAINER_ARRAYS + _CONTAINER_EXTRA if getattr(container, name) is not None}
+    arrays |= {f"{index}_cloud": flatten_cloud(container.cloud) for index, container in enumerate(
+        result.objects.values()) if container.cloud is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -115,7 +120,8 @@ def read_result(folder: Path) -> BakeResult:
     for index, (name, header) in enumerate(zip(stored["names"], stored["headers"], strict=True)):
         parts = [arrays[f"{index}_{part}"] for part in _CONTAINER_ARRAYS]
         extra = {part: arrays.get(f"{index}_{part}") for part in _CONTAINER_EXTRA}
-        container = BakedTransfer(check_header(header, name), *parts, **extra)
+        cloud = read_cloud(check_header(header, name), arrays.get(f"{index}_cloud"), name)
+        container = BakedTransfer(header, *parts, **extra, cloud=cloud)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

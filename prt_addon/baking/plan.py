@@ -19,6 +19,7 @@ PATH_RAYS_PER_SECOND = 0.8e6
 SECONDS_PER_BOUNCED_VALUE = 2e-8
 SECONDS_PER_ENCODED_VALUE = 1.2e-8
 SECONDS_PER_GLOSSY_VALUE = 1e-7
+SECONDS_PER_LOCAL_VALUE = 2e-7
 SECONDS_PER_SUBSURFACE_VALUE = 2e-6
 BYTES_PER_RAY_HIT = 24
 # Smaller clusters cost more in bases, and in constants at each light change, than their points save.
@@ -70,6 +71,10 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
         rows = len(surfaces.functions) * columns * needs.channels * glossy
         seconds["glossy"] = 0.1 + rows * SECONDS_PER_GLOSSY_VALUE
         values += rows
+    if settings.local_light:
+        local = receivers * settings.cloud_lights * max(settings.cloud_emission, 1) ** 2
+        rays["local"] = receivers * settings.cloud_lights if needs.bounces else 0
+        seconds["local"] = 0.2 + rays["local"] / SHADOW_RAYS_PER_SECOND + local * SECONDS_PER_LOCAL_VALUE
     if translucent:
         seconds["subsurface"] = 0.2 + translucent * columns * needs.channels * SECONDS_PER_SUBSURFACE_VALUE
     seconds["encode"] = 0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE

@@ -11,7 +11,7 @@ import time
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from scipy import sparse
 from ..basis.directions import quadrature
 from ..compression.coherence import Coherence, make_coherent
 from ..compression.encoding import Encoding, encode
+from ..compression.groups import encode_groups
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
@@ -41,17 +42,24 @@ from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, Indirect
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
+from .highlight_budget import HighlightSample, highlight_budget
+from .highlight_reference import TrueSurfaces
+from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
 from .plan import Plan, make_plan, most_clusters
-from .results import object_container, report_of, stability_of, surface_checks
+from .results import LocalColumns, object_container, report_of, stability_of, surface_checks
 from .settings import BakeSettings
 from .surfaces import CONSTANT, INCIDENT_ORDER, row_metric
-from .translucency import BodyLight, light_through_bodies
+from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
 POLL_SECONDS = 0.05
+# Shadow rays of a bake for local lights alone, where distant light only checks the scene.
+DIRECTIONS_OF_CHECKS = 256
 # Receivers whose layers leave less of the diffuse one than this say nothing about its error.
 LEAST_DIFFUSE = 0.05
 # Share of glossy surfaces among what glossy receivers see from which on their light is followed by its direction.
 LEAST_GLOSSY_HITS = 0.01
+# Receivers whose rows are copied at once.
+ROWS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
@@ -77,13 +85,19 @@ Steps = Generator[Progress, None, Any]
 
 def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
          light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
-         ) -> Generator[Progress, None, BakeResult]:
+         regions: NDArray[np.float64] | None = None) -> Generator[Progress, None, BakeResult]:
     """Yield progress and return the result.
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
-    in the headers. Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
+    scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}).run())
+    if not settings.distant_light:
+        # A white sky of one coefficient still tells what is buried, dark, or brighter than it can be.
+        settings = replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS),
+                           error_receivers=0, glossy_rows=0, subsurface=False)
+    regions = np.empty((0, 4, 4)) if regions is None else regions
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions).run())
 
 
 @dataclass
@@ -95,9 +109,13 @@ class _Bake:
     folder: Path | None
     light: ReferenceLight | None
     digests: dict[str, str]
+    regions: NDArray[np.float64]
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
+    cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    local: LocalTransfer | None = None
+    local_scale: float = 1.0
 
     def run(self) -> Generator[Progress, None, BakeResult]:
         """All stages in order."""
@@ -125,19 +143,32 @@ class _Bake:
         if visibility is not None:
             with self.timer.stage("glossy"):
                 glossy = yield from self._glossy(receivers, transfer, visibility, gathered)
+        local = None
+        if self.settings.local_light:
+            with self.timer.stage("local"):
+                local = yield from self._local(gathered)
+        # What later stages do not read is large: rays' hits, visibility, the operator.
+        gathered, bounced, visibility = _numbers_of(gathered), _numbers_of(bounced), None
         transfer = self._by_point(receivers, transfer)
         if self.translucent.any():
             with self.timer.stage("subsurface"):
                 subsurface = yield from self._subsurface(transfer)
         with self.timer.stage("encode"):
+            yield self._progress("encode", 0.0)
+            buried = self._find_buried(transfer)
             signals = self._signals(transfer, glossy, subsurface)
-            self._fill_buried(transfer, signals)
+            self._join_local(signals, local)
+            self._choose_highlights(glossy, signals)
+            glossy = None
+            self._fill_buried(buried, signals)
             encodings = yield from self._encode(signals)
         errors: dict[str, Any] = {}
+        highlights: dict[str, Any] = {}
         if self.settings.error_receivers and len(self.open_keys):
             with self.timer.stage("errors"):
                 errors = yield from self._errors(transfer, encodings)
-        return self._result(gathered, bounced, transfer, encodings, errors, subsurface)
+                highlights = yield from self._highlight_errors(encodings)
+        return self._result(gathered, bounced, transfer, encodings, (errors, highlights), subsurface)
 
     def _progress(self, stage: str, fraction: float) -> Progress:
         seconds = self.plan.seconds
@@ -147,15 +178,44 @@ class _Bake:
         left = elapsed * (1.0 - overall) / overall if overall > 0.02 and elapsed > 0.5 else None
         return Progress(stage, overall, self.tracer.rays if self.tracer else 0, left)
 
-    def _follow(self, stage: str, steps: Generator[float, None, Any]) -> Steps:
-        """Pass a fill's progress on and return its result."""
+    def _follow(self, stage: str, steps: Generator[float, None, Any], first: float = 0.0, last: float = 1.0) -> Steps:
+        """Pass a fill's progress on, as the part of the stage from first to last, and return its result."""
+        yield self._progress(stage, first)
         try:
             while True:
-                yield self._progress(stage, next(steps))
+                yield self._progress(stage, first + (last - first) * next(steps))
         except StopIteration as end:
             return end.value
         finally:
             steps.close()
+
+    def _follow_slow(self, stage: str, steps: Generator[float, None, Any]) -> Steps:
+        """As `_follow`, for few long steps: between them the fraction creeps on by what the last two were apart.
+
+        A thread takes one step after the other; a cancel waits for the end of the present one.
+        """
+        reached, width, seconds = 0.0, 0.0, np.inf
+        yield self._progress(stage, 0.0)
+        with ThreadPoolExecutor(1) as pool:
+            try:
+                while True:
+                    started = time.perf_counter()
+                    future = pool.submit(_next_or_end, steps)
+                    while True:
+                        try:
+                            fraction, result = future.result(POLL_SECONDS)
+                            break
+                        except StillRunning:
+                            share = (time.perf_counter() - started) / seconds
+                            yield self._progress(stage, reached + width * share / (1.0 + share))
+                    if fraction is None:
+                        return result
+                    seconds = time.perf_counter() - started
+                    width, reached = max(fraction - reached, 0.0), max(fraction, reached)
+                    yield self._progress(stage, reached)
+            finally:
+                pool.shutdown()
+                steps.close()
 
     def _load(self, stage: str) -> tuple[dict[str, NDArray], dict[str, Any]] | None:
         path = self.folder / f"{stage}.npz" if self.folder else None
@@ -230,16 +290,19 @@ class _Bake:
         return receivers, transfer, visibility
 
     def _glossy(self, receivers: ReceiverSet, transfer: NDArray[np.float32], visibility: VisibilityCoefficients,
-                gathered: Gather | None) -> Generator[Progress, None, NDArray[np.float32]]:
-        """Rows (p, functions, columns, channels) of highlights, by point; zero at points without one.
+                gathered: Gather | None) -> Generator[Progress, None, GlossyRows]:
+        """Rows of highlights.
 
         transfer: (r, columns, channels) of the receivers, with all bounces.
         """
+        scene = self.scene
+        points = receivers.key[visibility.rows]
+        # In the first round, and so from the second bounce on, glossy surfaces send to each other as much, but evenly.
+        self.glossy_bounce = gathered is not None and gathered.hits is not None and \
+            self._share_of_glossy_hits(gathered.hits) > LEAST_GLOSSY_HITS
         stored = self._load("glossy")
         if stored is not None:
-            return stored[0]["rows"]
-        scene, channels = self.scene, self.plan.needs.channels
-        points = receivers.key[visibility.rows]
+            return GlossyRows(points, stored[0]["rows"])
         used = np.unique(scene.material[points])
         kernels = tuple(self.surfaces.parts[number].kernel for number in used)
         width = max(kernel.shape[2] for kernel in kernels)
@@ -248,24 +311,21 @@ class _Bake:
                                   np.searchsorted(used, scene.material[points]), kernels)
         frames, order = surfaces.frames, self.plan.needs.order
         indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
+        first_round = 0.3 if self.glossy_bounce else 1.0
         found = yield from self._follow("glossy", glossy_transfer(
-            self.tracer, surfaces, order, visibility.visible, indirect))
-        if indirect is not None and self._share_of_glossy_hits(gathered.hits) > LEAST_GLOSSY_HITS:
-            # Once more, with what was just found as the light that glossy surfaces send to each other. In the first
-            # round, and so from the second bounce on, they reflect as much, but evenly.
-            bounce = GlossyRadiance(gathered.hits, scene, receivers.key[visibility.rows], frames, found,
-                                    self.surfaces.functions)
+            self.tracer, surfaces, order, visibility.visible, indirect), 0.0, first_round)
+        if self.glossy_bounce:
+            # Once more, with what was just found as the light that glossy surfaces send to each other.
+            bounce = GlossyRadiance(gathered.hits, scene, points, frames, found, self.surfaces.functions)
             albedo = self.surfaces.diffuse_albedo(scene)
             indirect = self._indirect(gathered, receivers, transfer, visibility, albedo, bounce)
             found = yield from self._follow("glossy", glossy_transfer(
-                self.tracer, surfaces, order, visibility.visible, indirect))
+                self.tracer, surfaces, order, visibility.visible, indirect), first_round, 1.0)
         windows = np.array([self.surfaces.parts[number].window[:found.shape[2]] for number in used], np.float32)
         if (windows < 1.0).any():
             found *= windows[surfaces.material][:, None, :, None]
-        rows = np.zeros((len(scene.points), *found.shape[1:3], channels), np.float32)
-        rows[points] = found  # one channel serves all three
-        self._save("glossy", {"rows": rows})
-        return rows
+        self._save("glossy", {"rows": found})
+        return GlossyRows(points, found)
 
     def _indirect(self, gathered: Gather | None, receivers: ReceiverSet, transfer: NDArray[np.float32],
                   visibility: VisibilityCoefficients, albedo: NDArray[np.float32], bounce: GlossyRadiance | None,
@@ -286,10 +346,51 @@ class _Bake:
 
     def _subsurface(self, transfer: NDArray[np.float32]) -> Generator[Progress, None, list[BodyLight]]:
         """Light that travels through each object's translucent materials. transfer: (p, columns, channels)."""
-        return (yield from self._follow("subsurface", light_through_bodies(
-            self.scene, self.surfaces, self.translucent, transfer, self.tracer.threads, self.settings.seed)))
+        stored = self._load("subsurface")
+        if stored is not None:
+            return unpacked_bodies(*stored)
+        bodies = yield from self._follow("subsurface", light_through_bodies(
+            self.scene, self.surfaces, self.translucent, transfer, self.tracer.threads, self.settings.seed))
+        self._save("subsurface", *packed_bodies(bodies))
+        return bodies
 
-    def _signals(self, transfer: NDArray[np.float32], glossy: NDArray[np.float32] | None,
+    def _local(self, gathered: Gather | None) -> Generator[Progress, None, LocalTransfer]:
+        """The transfer of local lights, by point."""
+        stored = self._load("local")
+        if stored is not None:
+            return unpacked_local(*stored)
+        albedo = None
+        if gathered is not None:
+            albedo = self.albedo[gathered.receivers.key % len(self.scene.points)][:, :self.plan.needs.channels]
+        local = yield from self._follow("local", local_transfer(
+            self.tracer, self.scene, gathered, albedo, self.keys, self.regions, self.settings, self.folder))
+        self._save("local", *packed_local(local))
+        return local
+
+    def _join_local(self, signals: dict[str, NDArray[np.float32]], local: LocalTransfer | None) -> None:
+        """Put the columns of local lights behind those of distant light, or in their place where that is not baked.
+
+        One encoding holds both. Distant light is radiance, a cloud's light 1 W/sr from metres away: numbers of very
+        different size, so that a scale makes both parts weigh the same, taken out of the bases again.
+        """
+        self.local = local
+        if local is None:
+            return
+        share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
+        distant = sum(float(np.sum(np.square(s, dtype=np.float64))) for s in signals.values())
+        near = float(np.sum(np.square(local.transfer[self.keys], dtype=np.float64)))
+        both = self.settings.distant_light and distant > 0.0 and near > 0.0
+        self.local_scale = np.sqrt(distant / near) if both else 1.0
+        for target in self.targets:
+            before = signals[target.name]
+            columns = before.shape[2] if self.settings.distant_light else 0
+            joined = np.zeros((*before.shape[:2], columns + local.transfer.shape[1], before.shape[3]), np.float32)
+            joined[:, :, :columns] = before[:, :, :columns]
+            dimmed = share[self.scene.material[target.points], None, None] * np.float32(self.local_scale)
+            joined[:, 0, columns:] = local.transfer[target.points] * dimmed
+            signals[target.name] = joined
+
+    def _signals(self, transfer: NDArray[np.float32], glossy: GlossyRows | None,
                  subsurface: list[BodyLight]) -> dict[str, NDArray[np.float32]]:
         """Each target's M_p (p, rows, columns, channels): the diffuse row, then those of the view direction."""
         scene, channels = self.scene, self.plan.needs.channels
@@ -300,8 +401,8 @@ class _Bake:
             material, diffuse = scene.material[target.points], transfer[target.points]
             signal = np.zeros((len(diffuse), 1 + len(functions), diffuse.shape[1], channels), np.float32)
             signal[:, 0] = diffuse * share[material, None, None]
-            if glossy is not None and len(functions) == glossy.shape[1]:
-                signal[:, 1:] = glossy[target.points]
+            if glossy is not None and len(functions) == glossy.rows.shape[1]:
+                glossy.write(signal[:, 1:], target.points)
                 self._add_dimming(signal, material, diffuse, scene.albedo[target.points])
             for entry in subsurface:
                 if entry.target == target.name:
@@ -332,7 +433,7 @@ class _Bake:
         if stored is not None:
             return Interreflection(stored[0]["transfer"], **stored[1])
         point = gathered.receivers.key % len(self.scene.points)
-        bounced = yield from self._follow("interreflection", interreflect(
+        bounced = yield from self._follow_slow("interreflection", interreflect(
             gathered.matrix, self.albedo[point][:, :self.plan.needs.channels], direct, self.settings.bounce_error,
             self.settings.bounces))
         numbers = {k: v for k, v in asdict(bounced).items() if k != "transfer"}
@@ -346,11 +447,16 @@ class _Bake:
         result[receivers.key[front]] = transfer[front]
         return result
 
-    def _fill_buried(self, transfer: NDArray[np.float32], signals: dict[str, NDArray[np.float32]]) -> None:
-        """Replace what lies inside other bodies, and keep it out of the error budget: nobody sees it."""
+    def _find_buried(self, transfer: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Keys of what lies inside other bodies. It is kept out of the error budget: nobody sees it."""
         receivers = self.receivers.taken(np.flatnonzero(np.isin(self.receivers.key, self.keys)))
         white = transfer[receivers.key, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
         buried = buried_receivers(self.tracer, self.scene, receivers, white)
+        self.open_keys = np.setdiff1d(self.keys, buried, assume_unique=True)
+        return buried
+
+    def _fill_buried(self, buried: NDArray[np.int64], signals: dict[str, NDArray[np.float32]]) -> None:
+        """Replace what lies inside other bodies."""
         self.filled = 0
         for target in self.targets:
             place = target.points
@@ -358,7 +464,19 @@ class _Bake:
             if len(inside):
                 triangles = self.scene.triangles[target.triangles] - place.start
                 self.filled += fill_buried(triangles, self.scene.loose[place], inside, signals[target.name])
-        self.open_keys = np.setdiff1d(self.keys, buried, assume_unique=True)
+
+    def _choose_highlights(self, glossy: GlossyRows | None, signals: dict[str, NDArray[np.float32]]) -> None:
+        """Keep of random glossy receivers what the error budget needs once the rest is encoded and gone."""
+        self.highlights: tuple[NDArray, ...] | None = None
+        if glossy is None or not self.settings.error_receivers:
+            return
+        keys = choose_receivers(self.open_keys[self.glossy[self.open_keys]], self.settings.error_receivers,
+                                self.settings.seed)
+        if len(keys):
+            before = np.concatenate([signals[t.name][keys[(keys >= t.points.start) & (keys < t.points.stop)]
+                                                     - t.points.start, 1:] for t in self.targets
+                                     if signals[t.name].shape[1] == 1 + glossy.rows.shape[1]])
+            self.highlights = keys, glossy.at(keys), before
 
     def _encode(self, signals: dict[str, NDArray[np.float32]]) -> Generator[Progress, None, dict[str, Encoding]]:
         """Each target's encoding; a thread encodes while this one reports, so that a bake can be cancelled."""
@@ -390,8 +508,12 @@ class _Bake:
     def _encode_one(self, target: SceneObject, signal: NDArray[np.float32], settings: EncoderSettings,
                     metric: NDArray[np.float64] | None, state: _EncodeState) -> Encoding:
         """One target's encoding, made coherent where that is asked for."""
-        encoding = encode(signal, settings, metric, state.report)
-        if self.settings.coherence > 0.0:
+        if self.local is None:
+            encoding = encode(signal, settings, metric, state.report)
+        else:
+            zone = self.local.zone[target.points][~self.scene.loose[target.points]]
+            encoding, self.cluster_zone[target.name] = encode_groups(signal, zone, settings, metric, state.report)
+        if self.settings.coherence > 0.0 and self.local is None:  # it would move points out of their zones
             place = np.cumsum(~self.scene.loose[target.points]) - 1
             triangles = place[self.scene.triangles[target.triangles] - target.points.start]
             encoding, self.coherence[target.name] = make_coherent(
@@ -416,42 +538,116 @@ class _Bake:
                                 settings.seed)
         if not len(keys):
             return {}
-        compressed = self._compressed(keys, encodings, (transfer.shape[1], channels)) / share[keys, None, None]
+        shape = (1, transfer.shape[1], channels)
+        compressed = self._compressed(keys, encodings, slice(0, 1), shape)[:, 0] / share[keys, None, None]
         before = np.broadcast_to(transfer[keys], compressed.shape).astype(np.float64)
-        steps = error_budget(self.tracer, self.scene, self.albedo, BakedSample(keys, before, compressed),
-                             self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
-                             settings.error_paths, settings.seed)
-        return (yield from self._follow("errors", steps))
+        sample = BakedSample(keys, before, compressed, *self._objects_of(keys))
+        steps = error_budget(self.tracer, self.scene, self.albedo, sample, self.light or stand_in_light(),
+                             self.plan.needs.order, settings.bounces, settings.error_paths, settings.seed)
+        last = 1.0 if self.highlights is None else 0.5
+        return (yield from self._follow("errors", steps, 0.0, last))
 
-    def _compressed(self, keys: NDArray[np.int64], encodings: dict[str, Encoding], shape: tuple[int, int],
-                    ) -> NDArray[np.float64]:
-        """Decoded diffuse rows (k, columns, channels) of the receivers `keys`."""
+    def _highlight_errors(self, encodings: dict[str, Encoding]) -> Generator[Progress, None, dict[str, Any]]:
+        """The error budget of the rows of highlights."""
+        if self.highlights is None:
+            return {}
+        settings = self.settings
+        keys, rows, before = self.highlights
+        rows = np.broadcast_to(rows, before.shape).astype(np.float64)  # one channel serves all three
+        # Subsurface light and the dimming of the diffuse layer are in the encoded rows too, with the same error.
+        compressed = rows + self._compressed(keys, encodings, slice(1, None), before.shape[1:]) - before
+        surfaces = TrueSurfaces.of(self.tracer, self.scene, self.surfaces, self.albedo)
+        sample = HighlightSample(keys, rows, compressed, self.surfaces.functions, *self._objects_of(keys))
+        return (yield from self._follow("errors", highlight_budget(
+            surfaces, sample, self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
+            int(self.glossy_bounce), settings.error_paths, settings.seed), 0.5, 1.0))
+
+    def _objects_of(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+        """The number of each receiver's target, and the targets' names."""
+        numbers = np.zeros(len(keys), np.int64)
+        for number, target in enumerate(self.targets):
+            numbers[(keys >= target.points.start) & (keys < target.points.stop)] = number
+        return numbers, tuple(target.name for target in self.targets)
+
+    def _compressed(self, keys: NDArray[np.int64], encodings: dict[str, Encoding], rows: slice,
+                    shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Some decoded rows (k, rows, columns, channels) of the receivers `keys`; shape: without k."""
         result = np.zeros((len(keys), *shape))
         for target in self.targets:
             inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
-            place = np.cumsum(~self.scene.loose[target.points]) - 1
-            rows = place[keys[inside] - target.points.start]
-            values = decoded(encodings[target.name], rows)
-            result[inside] = values.reshape(len(inside), self.shapes[target.name][0], *shape)[:, 0]
+            if len(inside):
+                place = np.cumsum(~self.scene.loose[target.points]) - 1
+                values = decoded(encodings[target.name], place[keys[inside] - target.points.start])
+                values = values.reshape(len(inside), *self.shapes[target.name])
+                result[inside] = values[:, rows, :shape[1]]  # without the columns of local lights
         return result
 
     def _result(self, gathered: Gather | None, bounced: Interreflection | None, transfer: NDArray[np.float32],
-                encodings: dict[str, Encoding], errors: dict[str, Any], bodies: list[BodyLight]) -> BakeResult:
+                encodings: dict[str, Encoding], errors: tuple[dict[str, Any], dict[str, Any]],
+                bodies: list[BodyLight]) -> BakeResult:
+        """errors: the budget of diffuse light and that of highlights."""
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
         stability += surface_checks(self.surfaces, bodies)
-        report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, errors,
+        report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
+        if self.local is not None:
+            report["local"] = self.local.facts
+            report["scene"]["warnings"] += self.local.facts["warnings"]
         if self.filled:
             note = f"{self.filled} receivers inside other objects take their neighbours' light"
             report["scene"]["warnings"].append(note)
         objects = {
             target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],
                                           self.surfaces.functions_of_object(self.scene, target), self.settings, report,
-                                          self.digests.get(target.name, ""))
+                                          self.digests.get(target.name, ""), self._local_columns(target.name))
             for target in self.targets
         }
         return BakeResult(objects, report)
+
+    def _local_columns(self, name: str) -> LocalColumns | None:
+        """What a container tells of its local lights."""
+        if self.local is None:
+            return None
+        return LocalColumns(self.local.cloud, self.cluster_zone[name], self.local_scale)
+
+
+@dataclass(frozen=True)
+class GlossyRows:
+    """points: (g,) of the receivers with highlights; rows: (g, functions, columns, 1 or 3)."""
+
+    points: NDArray[np.int64]
+    rows: NDArray[np.float32]
+
+    def write(self, signal: NDArray[np.float32], place: slice) -> None:
+        """Put the rows of a target's points into a signal (p, functions, columns, channels), block by block.
+
+        One channel serves all three.
+        """
+        inside = np.flatnonzero((self.points >= place.start) & (self.points < place.stop))
+        for start in range(0, len(inside), ROWS_AT_ONCE):
+            block = inside[start:start + ROWS_AT_ONCE]
+            signal[self.points[block] - place.start] = self.rows[block]
+
+    def at(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The rows of these points."""
+        order = np.argsort(self.points)
+        return self.rows[order[np.searchsorted(self.points, keys, sorter=order)]]
+
+
+def _next_or_end(steps: Generator[float, None, Any]) -> tuple[float | None, Any]:
+    """The next fraction, or None and the result."""
+    try:
+        return next(steps), None
+    except StopIteration as end:
+        return None, end.value
+
+
+def _numbers_of(found: Any) -> Any:
+    """A gather or an interreflection without its large arrays: what the report tells of it."""
+    if isinstance(found, Gather):
+        return replace(found, receivers=None, matrix=None, hits=None)
+    return found if found is None else replace(found, transfer=None)
 
 
 GATHER_NUMBERS = ("hit_share", "back_share", "lost_share", "two_sided")

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from ..basis.hemisphere import Indices, hemisphere_basis
 from ..compression.coherence import Coherence, overdraw
 from ..compression.encoding import Encoding
+from ..lighting.light_cloud import LightCloud
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import remove_ringing
 from ..reporting.stages import StageTimer
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..storage.columns import Columns, columns_entry
 from ..storage.container import CONSTANT_ROWS, BakedTransfer, hemisphere_rows, make_header
 from ..storage.digests import digest_json
 from ..transport.gather import Gather
@@ -37,18 +39,22 @@ LOST_LIMIT = 0.25
 
 def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, shape: tuple[int, int, int],
                      functions: Indices, settings: BakeSettings, report: dict[str, Any], geometry_digest: str,
-                     ) -> BakedTransfer:
-    """The container of one target. shape: (rows, columns, channels); functions: of rows 1, 2, ... Loose points join
-    cluster 0 with no weights."""
+                     local: LocalColumns | None = None) -> BakedTransfer:
+    """The container of one target. shape: (rows, columns, channels); functions: of rows 1, 2, ...; local: what is to
+    be known of columns of local lights. Loose points join cluster 0 with no weights."""
     bases = encoding.bases.reshape(*encoding.bases.shape[:2], *shape)
     count, solid = target.points.stop - target.points.start, ~scene.loose[target.points]
     cluster = np.zeros(count, np.int32)
     weights = np.zeros((count, encoding.weights.shape[1]), np.float32)
     cluster[solid], weights[solid] = encoding.cluster, encoding.weights
-    order = round(shape[1] ** 0.5)
+    if local is None:
+        columns = columns_entry(Columns(round(shape[1] ** 0.5)))
+    else:
+        columns = local.entry(shape[1])
+        bases[:, :, :, shape[1] - local.cloud.columns:] /= np.float32(local.scale)
     header = make_header(
         bases.shape,
-        {"kind": "spherical_harmonics", "order": order, "condon_shortley": False},
+        columns,
         hemisphere_rows(functions) if len(functions) else CONSTANT_ROWS,
         object=target.name,
         vectors_per_cluster=[int(v) for v in encoding.vectors_per_cluster],
@@ -64,7 +70,25 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
     return BakedTransfer(header, cluster, weights, np.ascontiguousarray(bases, np.float32),
                          np.ascontiguousarray(scene.albedo[points], np.float32),
                          scene.points[points].astype(np.float32), scene.normals[points].astype(np.float32), triangles,
-                         scene.tangents[points].astype(np.float32) if len(functions) else None)
+                         scene.tangents[points].astype(np.float32) if len(functions) else None,
+                         None if local is None else local.cloud)
+
+
+@dataclass(frozen=True)
+class LocalColumns:
+    """cloud: whose lights the last columns belong to; cluster_zone: (clusters,) int32; scale: factor that these columns
+    were encoded with."""
+
+    cloud: LightCloud
+    cluster_zone: NDArray[np.int32]
+    scale: float
+
+    def entry(self, columns: int) -> dict[str, Any]:
+        """`columns` of a header, for so many in all."""
+        cloud = self.cloud
+        basis = Columns(round((columns - cloud.columns) ** 0.5), cloud.columns)
+        return columns_entry(basis, cloud.emission_order, float(cloud.spacing), float(cloud.radius),
+                             tuple(np.diff(cloud.zone_starts)), tuple(self.cluster_zone))
 
 
 def _check(check: str, value: float, limit: float, good: str, bad: str) -> dict[str, Any]:
@@ -120,8 +144,8 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
 
 def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: StageTimer,
               encodings: dict[str, Encoding], coherence: dict[str, Coherence], errors: dict[str, Any],
-              stability: list[dict[str, Any]], gathered: Gather | None, bounced: Interreflection | None,
-              light: ReferenceLight | None, resumed: list[str], seconds: float) -> dict[str, Any]:
+              highlight_errors: dict[str, Any], stability: list[dict[str, Any]], gathered: Gather | None,
+              bounced: Interreflection | None, light: ReferenceLight | None, resumed: list[str], seconds: float) -> dict[str, Any]:
     """The report of design/contract.md, with what else a reader may want."""
     left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
     windowing = _windowing(light, plan.needs.order, left_out)
@@ -145,6 +169,7 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "left_out": [asdict(item) for item in left_out],
         "hints": list(plan.needs.hints),
         "errors": errors,
+        "highlight_errors": highlight_errors,
         "error_metric": "relative RMS of exit radiance over random receivers and channels, under "
                         + (light.description if light is not None else "a stand-in sky (the scene has no light)"),
         "clusters": _clusters(scene, encodings, coherence),

@@ -11,6 +11,9 @@ from ..errors import BadArguments
 
 HIGHEST_ORDER = 10
 GLOSSY_ROWS = (0, 4, 9, 16, 24, 25)
+LIGHTINGS = ("environment", "local", "environment,local")
+MERGED_RESPONSES = ("solution", "harmonic")
+MOST_CLOUD_LIGHTS = 4096
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,19 @@ class BakeSettings:
     glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
     fit_order_to_light: lower the order to what the scene's present light carries.
+    lighting: "environment" (World and Suns), "local" (lamps that move within a light cloud), or both with a comma.
+    cloud_region: name of a box empty, of a mesh that bounds a region, or of a collection of these, in which local
+        lights will move; "" = the scene's free space.
+    cloud_lights: most lights of the dense cloud (Kristensen 2005, section 4); each is one more global illumination
+        solution. cloud_spacing: metres between them instead; 0 = as cloud_lights allow.
+    cloud_emission: order of the spherical harmonics of a light's directional emission, for spots and area lights
+        (columns grow with its square); 0 = 1 where the scene has only Point lights, else 3.
+    cloud_radius: metres; lights are diffuse spheres of this radius; 0 = points.
+    zone_receivers: most receivers of a zone, in which lights merge for themselves (4.2); 0 = one zone.
+    merge_distance: as a fraction of the scene's diagonal, above which two lights never merge (the inverse of w1).
+    merge_response: as a fraction of the zone's brightest response, above which difference they never do (the inverse of
+        w2); 0 = no merging.
+    merged_response: "solution" = a new solution at the merged place, or "harmonic" = the mean as published (4.1).
     threads: 0 = one per core. seed: of all random choices.
     """
 
@@ -60,8 +76,28 @@ class BakeSettings:
     glossy_window: bool = True
     subsurface: bool = True
     fit_order_to_light: bool = False
+    lighting: str = "environment"
+    cloud_region: str = ""
+    cloud_lights: int = 216
+    cloud_spacing: float = 0.0
+    cloud_emission: int = 0
+    cloud_radius: float = 0.0
+    zone_receivers: int = 4096
+    merge_distance: float = 0.5
+    merge_response: float = 0.05
+    merged_response: str = "solution"
     threads: int = 0
     seed: int = 1
+
+    @property
+    def distant_light(self) -> bool:
+        """Whether World and Suns are baked."""
+        return "environment" in self.lighting.split(",")
+
+    @property
+    def local_light(self) -> bool:
+        """Whether lamps within a light cloud are baked."""
+        return "local" in self.lighting.split(",")
 
     def as_dict(self) -> dict[str, Any]:
         """All settings by name, as stored in report and header."""
@@ -69,11 +105,11 @@ class BakeSettings:
 
 
 PRESETS: dict[str, BakeSettings] = {
-    "draft": BakeSettings(order=4, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
+    "draft": BakeSettings(order=4, cloud_lights=64, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
                           encoder="static", compression_error=1e-2, spacing=1.0 / 32.0, error_receivers=32,
                           error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
     "standard": BakeSettings(),
-    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
+    "high": BakeSettings(order=7, cloud_lights=512, merge_response=0.02, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
                          encoder="adaptive", compression_error=5e-4, spacing=1.0 / 128.0, error_receivers=128,
                          error_paths=16384, glossy_rows=24, glossy_albedo=0.03),
 }
@@ -95,6 +131,13 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "error_paths": (64, 2 ** 20, "fewer say nothing"),
     "glossy_rows": (0, 25, "order 5 of the hemisphere"),
     "glossy_albedo": (0.0, 1.0, "it is a share of the light"),
+    "cloud_lights": (1, MOST_CLOUD_LIGHTS, "each is a global illumination solution"),
+    "cloud_spacing": (0.0, 1e9, "0 means as cloud_lights allow"),
+    "cloud_emission": (0, 4, "columns grow with its square"),
+    "cloud_radius": (0.0, 1e9, "0 means points"),
+    "zone_receivers": (0, 2 ** 31 - 1, "0 means one zone"),
+    "merge_distance": (0.0, 1e6, "it is a fraction of the scene"),
+    "merge_response": (0.0, 1e6, "it is a fraction of the brightest response"),
     "threads": (0, 1024, "0 means one per core"),
     "seed": (0, 2 ** 31 - 1, "a non-negative number"),
 }
@@ -134,6 +177,10 @@ def check(settings: BakeSettings) -> BakeSettings:
     if settings.glossy_rows not in GLOSSY_ROWS:
         raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
                            f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
+    for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES)):
+        if getattr(settings, name) not in words:
+            raise BadArguments(f"setting {name}", f"{getattr(settings, name)!r} is unknown",
+                               f"Use one of {' or '.join(words)}")
     if settings.encoder not in METHODS:
         raise BadArguments("setting encoder", f"{settings.encoder!r} is not an encoder",
                            f"Use one of {', '.join(METHODS)}")

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,9 @@ DARKEST = 1e-3
 @dataclass(frozen=True)
 class BodyLight:
     """target: the object's name; points: (k,) places among its points; material: its name; light: of the medium, for
-    a subsurface weight of 1; transfer: (k, columns, 3) float32 exit radiance, weight included; lost: largest share, of
-    the channels, of what a thick body of the medium returns of uniform light that this one does not return."""
+    a subsurface weight of 1, without its transfer; transfer: (k, columns, 3) float32 exit radiance, weight included;
+    lost: largest share, of the channels, of what a thick body of the medium returns of uniform light that this one does
+    not return."""
 
     target: str
     points: NDArray[np.int64]
@@ -56,7 +58,8 @@ def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: N
         except StopIteration as end:
             light = end.value
         weight = np.float32(surfaces.parts[number].subsurface_share)
-        result.append(BodyLight(target.name, points, material.name, light, light.transfer * weight,
+        numbers = replace(light, transfer=light.transfer[:0])
+        result.append(BodyLight(target.name, points, material.name, numbers, light.transfer * weight,
                                 _lost(medium, light)))
     return result
 
@@ -75,3 +78,29 @@ def point_areas(scene: SceneMesh, target: SceneObject) -> NDArray[np.float64]:
     area = 0.5 * np.sqrt(np.sum(across ** 2, axis=1))
     count = target.points.stop - target.points.start
     return np.bincount(triangles.ravel() - target.points.start, np.repeat(area / 3.0, 3), minlength=count)
+
+
+# The arrays and the numbers of a Subsurface that are stored with an interrupted bake.
+_ARRAYS, _NUMBERS = ("energy", "reduced"), ("places", "links", "error", "worst", "bound", "checked")
+
+
+def packed_bodies(bodies: list[BodyLight]) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Arrays and header of a finished stage."""
+    arrays: dict[str, NDArray] = {}
+    for index, body in enumerate(bodies):
+        arrays |= {f"{index}_points": body.points, f"{index}_transfer": body.transfer}
+        arrays |= {f"{index}_{name}": getattr(body.light, name) for name in _ARRAYS}
+    return arrays, {"bodies": [{"target": body.target, "material": body.material, "lost": body.lost}
+                               | {name: getattr(body.light, name) for name in _NUMBERS} for body in bodies]}
+
+
+def unpacked_bodies(arrays: dict[str, NDArray], header: dict[str, Any]) -> list[BodyLight]:
+    """What `packed_bodies` took apart."""
+    result = []
+    for index, entry in enumerate(header["bodies"]):
+        transfer = arrays[f"{index}_transfer"]
+        light = Subsurface(transfer[:0], **{name: entry[name] for name in _NUMBERS},
+                           **{name: arrays[f"{index}_{name}"] for name in _ARRAYS})
+        result.append(BodyLight(entry["target"], arrays[f"{index}_points"], entry["material"], light, transfer,
+                                entry["lost"]))
+    return result

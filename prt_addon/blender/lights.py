@@ -50,19 +50,19 @@ class SunLight:
 
 def light_coefficients(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, order: int,
                        environment_override: str | PathLike[str] | None = None, rotate_degrees: float = 0.0,
-                       use_scene_lights: bool = True, window: bool = False) -> Light:
+                       use_scene_lights: bool = True, window: bool = False, name_lamps: bool = True) -> Light:
     """The scene's light up to `order` (1 to 10).
 
     environment_override: an equirectangular file in place of the World. rotate_degrees: a further Z rotation, as the
     World's Mapping node (type Point) means it; Suns do not turn along. use_scene_lights: with Suns. window: take the
-    ringing out where the light rings. Raises PRTError naming a missing or broken image.
+    ringing out where the light rings. name_lamps: warn of lamps near the scene, which are no part of this. Raises PRTError naming a missing or broken image.
     """
     environment = _environment(scene, depsgraph, environment_override)
     warnings = list(environment.warnings)
     rotation = world_rotation(rotate_degrees) @ environment.rotation  # small
     coefficients = rotate(environment.projected.coefficients[:order * order], rotation) * environment.scale
     parts = [_part(environment.name, environment.kind, coefficients, environment.projected.truncation(order))]
-    for lamp in read_suns(depsgraph, warnings) if use_scene_lights else ():
+    for lamp in read_suns(depsgraph, warnings, name_lamps) if use_scene_lights else ():
         added = sun(lamp.direction, lamp.irradiance, lamp.angle, order)
         parts.append(_part(lamp.name, "sun", added, None))
         coefficients = coefficients + added
@@ -106,8 +106,8 @@ def _part(name: str, kind: str, coefficients: NDArray[np.float64], truncation: f
     return {"name": name, "kind": kind, "energy": float(band_energies(coefficients).sum()), "truncation": truncation}
 
 
-def read_suns(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> list[SunLight]:
-    """Suns that a render shows, instanced ones too; other lights are named in `warnings`."""
+def read_suns(depsgraph: bpy.types.Depsgraph, warnings: list[str], name_lamps: bool = True) -> list[SunLight]:
+    """Suns that a render shows, instanced ones too; other lights are named in `warnings` where name_lamps."""
     visible = render_visible_objects(depsgraph.view_layer)
     found: list[SunLight] = []
     reached: set[str] = set()
@@ -117,9 +117,10 @@ def read_suns(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> list[SunLi
         if instance.object.type != "LIGHT" or owner.name_full not in visible or source.hide_render:
             continue
         reached.add(source.name_full)
-        _add(found, instance.object, np.array(instance.matrix_world, np.float64), warnings)
+        if name_lamps or instance.object.data.type == "SUN":
+            _add(found, instance.object, np.array(instance.matrix_world, np.float64), warnings)
     for name, lamp in visible.items():
-        if lamp.type == "LIGHT" and name not in reached:
+        if lamp.type == "LIGHT" and name not in reached and (name_lamps or lamp.data.type == "SUN"):
             warnings.append(f"{lamp.name}: the viewport hides it, but it lights, because a render shows it")
             _add(found, lamp, np.array(lamp.matrix_world, np.float64), warnings)
     return found

@@ -94,7 +94,8 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
     if header["shape"][2] > 1:
         local = _read_attribute(mesh, TANGENT_ATTRIBUTE, 3, scene_object.name)[:, :3]
         tangents = tangent_frame(transform_rows(local, matrix[:3, :3]), geometry[2].astype(np.float64))
-    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents)
+    cloud = _read_numbers(mesh, container.CLOUD_PROPERTY) if container.CLOUD_PROPERTY in mesh else None
+    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud)
 
 
 def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
@@ -223,7 +224,8 @@ def _check_shapes(name: str, baked: BakedTransfer) -> None:
     clusters, representatives, rows, columns, channels = baked.bases.shape
     header = {**baked.header, "shape": [clusters, representatives, rows, columns, channels]}
     container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
-                     (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents)
+                     (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents,
+                     container.flatten_cloud(baked.cloud) if baked.cloud is not None else None)
     if baked.weights.shape[1] != representatives - 1:
         raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
 
@@ -256,6 +258,8 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
         _write_attribute(mesh, TANGENT_ATTRIBUTE, "FLOAT_VECTOR", local_tangents)
     _write_attribute(mesh, container.ALBEDO_ATTRIBUTE, "FLOAT_COLOR", opaque)
     mesh[container.BASES_PROPERTY] = np.ascontiguousarray(baked.bases, np.float32).ravel()
+    if baked.cloud is not None:
+        mesh[container.CLOUD_PROPERTY] = container.flatten_cloud(baked.cloud)
     mesh[container.HEADER_PROPERTY] = json.dumps(header)
 
 
@@ -288,13 +292,21 @@ def _read_attribute(mesh: bpy.types.Mesh, name: str, least_width: int, subject: 
 
 def _read_bases(mesh: bpy.types.Mesh, subject: str) -> NDArray[np.float32]:
     """The flattened bases. Raises StorageError where the property is missing or was replaced by something else."""
-    bases = mesh.get(container.BASES_PROPERTY)
-    if bases is None:
+    if container.BASES_PROPERTY not in mesh:
         raise StorageError(subject, "its baked data has no bases", container.REBAKE)
+    bases = _read_numbers(mesh, container.BASES_PROPERTY)
+    if bases is None:
+        raise StorageError(subject, "the bases of its baked data are no numbers", container.REBAKE)
+    return bases.astype(np.float32)
+
+
+def _read_numbers(mesh: bpy.types.Mesh, name: str) -> NDArray | None:
+    """A property of a list of numbers; None where it was replaced by something else."""
     try:
-        return np.array(bases, np.float32)
-    except (TypeError, ValueError) as error:
-        raise StorageError(subject, "the bases of its baked data are no numbers", container.REBAKE) from error
+        numbers = np.array(mesh[name])
+        return numbers if numbers.dtype.kind == "f" else numbers.astype(np.float64)
+    except (TypeError, ValueError):
+        return None
 
 
 def _clear_mesh(mesh: bpy.types.Mesh) -> None:
@@ -302,7 +314,7 @@ def _clear_mesh(mesh: bpy.types.Mesh) -> None:
     active, default = mesh.color_attributes.active_color_name, mesh.color_attributes.default_color_name
     for name in [a.name for a in mesh.attributes if a.name.startswith(OURS)]:
         mesh.attributes.remove(mesh.attributes[name])
-    for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY):
+    for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY, container.CLOUD_PROPERTY):
         if key in mesh:
             del mesh[key]
     if active in mesh.color_attributes:

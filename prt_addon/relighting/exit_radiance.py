@@ -35,19 +35,43 @@ class Baked(Protocol):
         """The spherical harmonics of the exit direction that rows 1, 2, ... belong to."""
         ...
 
+    @property
+    def cluster_zone(self) -> NDArray[np.int32] | None:
+        """The zone of the light cloud that each cluster lies in; None without local lights."""
+        ...
 
-def cluster_constants(bases: FloatArray, light: ArrayLike) -> FloatArray:
+
+def cluster_constants(bases: FloatArray, light: ArrayLike, cluster_zone: NDArray[np.integer] | None = None,
+                      ) -> FloatArray:
     """Each basis of each cluster applied to the light: (clusters, vectors + 1, rows, 3) float32.
 
     bases: (clusters, vectors + 1, rows, columns, channels) float32, channels 1 (neutral transfer) or 3;
-    light: (columns, 3) radiance coefficients. Raises ValueError where the shapes do not fit.
+    light: (columns, 3) coefficients, or (zones, columns, 3) where they differ by zone (local lights), with cluster_zone
+    (clusters,) saying which zone each cluster lies in. Raises ValueError where the shapes do not fit.
     """
     light = np.asarray(light)
     if bases.ndim != 5 or bases.shape[4] not in (1, 3):
         raise ValueError(f"bases must be (clusters, vectors + 1, rows, columns, 1 or 3), not {bases.shape}")
-    columns, channels = bases.shape[3:]
-    if light.shape != (columns, 3):
+    columns = bases.shape[3]
+    if light.ndim == 2 and light.shape == (columns, 3):
+        return _constants(bases, light)
+    if light.ndim != 3 or light.shape[1:] != (columns, 3):
         raise ValueError(f"the transfer has {columns} columns and needs light ({columns}, 3), not {light.shape}")
+    if cluster_zone is None or len(cluster_zone) != len(bases):
+        raise ValueError(f"light of {len(light)} zones needs the zone of each of {len(bases)} clusters")
+    result = np.zeros((*bases.shape[:3], 3), np.float32)
+    for zone in np.unique(cluster_zone):
+        if light[zone].any():
+            inside = np.flatnonzero(cluster_zone == zone)
+            # Clusters of a zone lie side by side, so that this is a view as a rule.
+            run = slice(inside[0], inside[-1] + 1) if inside[-1] - inside[0] == len(inside) - 1 else inside
+            result[run] = _constants(bases[run], light[zone])
+    return result
+
+
+def _constants(bases: FloatArray, light: NDArray) -> FloatArray:
+    """`cluster_constants` for one light (columns, 3)."""
+    columns, channels = bases.shape[3:]
     spread = np.zeros((columns, channels, 3), np.float32)
     if channels == 1:
         spread[:, 0] = light
@@ -87,28 +111,31 @@ def exit_radiance(cluster: NDArray[np.integer], weights: FloatArray, constants: 
 def diffuse_radiance(baked: Baked, light: ArrayLike) -> FloatArray:
     """Radiance (p, 3) float32 that leaves every receiver of diffuse transfer: unit-albedo exit radiance times albedo.
 
-    light: (columns, 3) coefficients. Raises ValueError where the transfer has more than the one diffuse row or the
+    light: as for `cluster_constants`. Raises ValueError where the transfer has more than the one diffuse row or the
     light has another number of columns.
     """
     if baked.bases.shape[2] != 1:
         raise ValueError(f"diffuse radiance needs transfer with 1 row, not {baked.bases.shape[2]}")
-    constants = cluster_constants(baked.bases, light)
+    constants = cluster_constants(baked.bases, light, baked.cluster_zone)
     return exit_radiance(baked.cluster, baked.weights, constants)[:, 0] * baked.albedo
 
 
-def view_radiance(baked: Baked, light: ArrayLike, views: ArrayLike) -> FloatArray:
+def view_radiance(baked: Baked, light: ArrayLike, views: ArrayLike, direct: FloatArray | None = None) -> FloatArray:
     """Radiance (p, 3) float32 that leaves every receiver towards its view, diffuse transfer too.
 
-    light: (columns, 3) coefficients; views: (p, 3) directions in world space when baked, away from the surface, of any
-    length above zero. Views from behind the surface: see `hemisphere_values`. Raises ValueError where shapes do not
-    fit.
+    light: as for `cluster_constants`; views: (p, 3) directions in world space when baked, away from the surface, of any
+    length above zero; direct: (p, rows, 3) direct light of lamps to add, None for none. Views from behind the surface:
+    see `hemisphere_values`. Raises ValueError where shapes do not fit.
     """
     views = np.asarray(views, np.float64)
     if views.shape != baked.normals.shape:
         raise ValueError(f"one view for each of {len(baked.normals)} receivers is needed, not {views.shape}")
+    constants = cluster_constants(baked.bases, light, baked.cluster_zone)
+    rows = exit_radiance(baked.cluster, baked.weights, constants)
+    if direct is not None:
+        rows = rows + direct
     if not baked.functions:
-        return diffuse_radiance(baked, light)
-    rows = exit_radiance(baked.cluster, baked.weights, cluster_constants(baked.bases, light))
+        return rows[:, 0] * baked.albedo
     values = hemisphere_values(baked.functions, local_views(views, baked.normals, baked.tangents))
     return combine_rows(rows, baked.albedo, values)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,13 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import StorageError
+from ..lighting.light_cloud import LightCloud
+from .columns import Columns, cloud_part, read_columns
 
-SCHEMA = 2  # highest that is read; 1: constant rows only
+SCHEMA = 3  # highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too
 CLUSTER_ATTRIBUTE = "prt_cluster"
 WEIGHTS_ATTRIBUTE = "prt_weights_"
 ALBEDO_ATTRIBUTE = "prt_albedo"
 HEADER_PROPERTY = "prt_header"
 BASES_PROPERTY = "prt_bases"
+CLOUD_PROPERTY = "prt_cloud"
 REBAKE = "Bake the object again"
 CONSTANT_ROWS: dict[str, Any] = {"kind": "constant"}
 HEMISPHERE_KIND = "constant_and_hemisphere"
@@ -38,6 +42,7 @@ class BakedTransfer:
     bases: (clusters, vectors + 1, rows, columns, channels) float32, vector 0 the cluster mean;
     albedo: (p, 3) float32; positions, normals: (p, 3) float32 world space when baked; triangles: (t, 3) int32;
     tangents: (p, 3) float32 likewise, unit, orthogonal to the normals; None where the only row is the diffuse one.
+    cloud: the local lights that columns belong to, world space when baked; None where all columns are distant light's.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
     x tangent, y normal x tangent, z normal.
@@ -52,6 +57,7 @@ class BakedTransfer:
     normals: NDArray[np.float32]
     triangles: NDArray[np.int32]
     tangents: NDArray[np.float32] | None = None
+    cloud: LightCloud | None = None
 
     @property
     def functions(self) -> tuple[int, ...]:
@@ -63,14 +69,28 @@ class BakedTransfer:
         """Number of lighting basis functions."""
         return self.bases.shape[3]
 
+    @property
+    def lighting_basis(self) -> Columns:
+        """What the columns stand for."""
+        part = cloud_part(self.header.get("columns"))
+        cloud = 0 if part is None else int(part["columns"])
+        return Columns(math.isqrt(self.bases.shape[3] - cloud), cloud)
+
+    @property
+    def cluster_zone(self) -> NDArray[np.int32] | None:
+        """(clusters,) int32, the zone of the light cloud that each cluster lies in; None without a cloud."""
+        part = cloud_part(self.header.get("columns"))
+        return None if part is None else np.array(part["cluster_zone"], np.int32)
+
 
 def make_header(shape: tuple[int, ...], columns: dict[str, Any], rows: dict[str, Any], **extra: Any) -> dict[str, Any]:
     """The header of a container: schema, shapes, conventions, lighting and exit basis, and what the caller adds.
 
     shape: of the bases (clusters, vectors + 1, rows, columns, channels).
     """
+    schema = 3 if cloud_part(columns) else 1 if rows.get("kind") == "constant" else 2
     return {
-        "schema": 1 if rows.get("kind") == "constant" else SCHEMA,
+        "schema": schema,
         "shape": [int(s) for s in shape],
         "columns": columns,
         "rows": rows,
@@ -95,6 +115,7 @@ def check_header(header: Any, subject: str) -> dict[str, Any]:
     if not (isinstance(shape, list) and len(shape) == 5 and all(type(s) is int and s > 0 for s in shape)):
         raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
     _check_rows(header, subject)
+    read_columns(header, subject, REBAKE)
     return header
 
 
@@ -132,17 +153,18 @@ def pack_weights(weights: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArray], flat_bases: NDArray,
            geometry: tuple[NDArray, NDArray, NDArray, NDArray], subject: str, tangents: NDArray | None = None,
-           ) -> BakedTransfer:
+           flat_cloud: NDArray | None = None) -> BakedTransfer:
     """The container from stored arrays, checked against the header.
 
-    geometry: albedo, positions, normals (p, 3) and triangles (t, 3); tangents (p, 3) where rows need them. Raises
-    StorageError where a shape, an index or a value can't be right, so that broken data is never drawn.
+    geometry: albedo, positions, normals (p, 3) and triangles (t, 3); tangents (p, 3) where rows need them; flat_cloud:
+    of `flatten_cloud` where columns need it. Raises StorageError where a shape, an index or a value can't be right, so
+    that broken data is never drawn.
     """
     clusters, representatives, rows, columns, channels = check_header(header, subject)["shape"]
     points, vectors = len(cluster), representatives - 1
     albedo, positions, normals, triangles = geometry
     expected = clusters * representatives * rows * columns * channels
-    if channels not in (1, 3) or round(columns ** 0.5) ** 2 != columns:
+    if channels not in (1, 3):
         raise StorageError(subject, "the header of its baked data states no valid shape", REBAKE)
     if flat_bases.size != expected:
         raise StorageError(subject, f"its bases hold {flat_bases.size} numbers instead of {expected}", REBAKE)
@@ -164,4 +186,24 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
     return BakedTransfer(header, np.asarray(cluster, np.int32), np.asarray(weights, np.float32), bases,
                          np.asarray(albedo, np.float32), np.asarray(positions, np.float32),
                          np.asarray(normals, np.float32), np.asarray(triangles, np.int32),
-                         None if tangents is None else np.asarray(tangents, np.float32))
+                         None if tangents is None else np.asarray(tangents, np.float32),
+                         read_cloud(header, flat_cloud, subject))
+
+
+def flatten_cloud(cloud: LightCloud) -> NDArray[np.float64]:
+    """A cloud's positions as one list of numbers: its zones' lights, then the lights of the cloud before merging."""
+    return np.concatenate([cloud.positions.ravel(), cloud.dense.ravel()])
+
+
+def read_cloud(header: dict[str, Any], flat_cloud: NDArray | None, subject: str) -> LightCloud | None:
+    """The light cloud of a header and its list of numbers; None where the header states none. Raises StorageError."""
+    part = cloud_part(header.get("columns"))
+    if part is None:
+        return None
+    starts = np.concatenate([[0], np.cumsum(part["lights"])])
+    numbers = None if flat_cloud is None else np.asarray(flat_cloud, np.float64)
+    if numbers is None or numbers.size % 3 or numbers.size < 3 * starts[-1] or not np.isfinite(numbers).all():
+        raise StorageError(subject, "the lights of its light cloud are missing or broken", REBAKE)
+    places = numbers.reshape(-1, 3)
+    return LightCloud(places[:starts[-1]], starts, part["emission_order"], places[starts[-1]:], part["spacing"],
+                      part["radius"])

@@ -16,6 +16,7 @@ from prt_addon.relighting.exit_radiance import cluster_constants, diffuse_radian
 def random_baked(points: int, clusters: int, vectors: int, rows: int, columns: int, channels: int) -> SimpleNamespace:
     random = np.random.default_rng(points + vectors + rows + channels)
     return SimpleNamespace(
+        cluster_zone=None,
         cluster=random.integers(0, clusters, points).astype(np.int32),
         weights=random.normal(size=(points, vectors)).astype(np.float32),
         bases=random.normal(size=(clusters, vectors + 1, rows, columns, channels)).astype(np.float32),

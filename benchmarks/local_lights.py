@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Local light clouds in the scenes of Kristensen et al. 2005, beside their Table 1 and against Cycles. Needs the bpy
+wheel.
+
+    python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze] [--positions 20] [--samples 256] [--set ...]
+
+Light moves to held-back random positions; indirect light there is compared with Cycles' own vertex bake of indirect
+light, as a relative RMS over vertices, channels and positions. Cycles is baked twice with other seeds; the mean of
+(ours - a)(ours - b) is the squared error without Cycles' own noise. Columns: `solver`, our solution at the very
+position (rays of the operator); `cloud`, what interpolation and merging add to it; `compression`; all of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from dataclasses import dataclass
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the bake's process; before numpy loads
+
+import bpy
+import local_scenes
+import numpy as np
+from common import drain, print_table
+from numpy.typing import NDArray
+
+from prt_addon.baking.recipe import _Bake
+from prt_addon.baking.settings import BakeSettings, make_settings
+from prt_addon.blender.read_scene import read_objects
+from prt_addon.lighting.light_cloud import box_matrix
+from prt_addon.lighting.light_visibility import surroundings
+from prt_addon.lighting.local_lights import LocalLight
+from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
+from prt_addon.relighting.lamp_light import LampLight
+from prt_addon.relighting.scene_light import joined_light
+from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.storage.container import BakedTransfer
+from prt_addon.tracing.tracer import Tracer
+from prt_addon.transport.local_lights import LightSolver
+from tests.blender.cycles import use_cycles, vertex_radiance
+
+PAPER = {"cornell": "4k, 8 zones, 216 -> 53, 30 clusters x 12, 58 fps", "hole": "5k, 10, 250 -> 49, 18 x 12, 55 fps",
+         "bunny": "11k, 11, 125, 22 x 16, 7 fps", "maze": "43k, 16, 1024 -> 128, 191 x 16, 7 fps"}
+LIGHTS = {"cornell": 216, "hole": 250, "bunny": 125, "maze": 1024}
+POWER = 4.0 * np.pi  # watts of a Point light of 1 W/sr
+
+
+@dataclass
+class Kept:
+    """What a bake keeps for the comparison: its solver, its scene and its transfer before compression."""
+
+    baked: BakedTransfer
+    solver: LightSolver
+    scene: SceneMesh
+    transfer: NDArray[np.float32]
+    report: dict
+    seconds: float
+
+
+class _KeepingBake(_Bake):
+    """A bake that keeps its operator."""
+
+    def _local(self, gathered):  # noqa: ANN001, ANN202
+        self.kept_gather = gathered
+        self.kept_local = yield from super()._local(gathered)
+        return self.kept_local
+
+
+def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSettings) -> Kept:
+    """Bake the object's vertices as they are."""
+    scene = SceneMesh.assemble(read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name], []), 0.0)
+    started = time.perf_counter()
+    bake = _KeepingBake(scene, settings, None, None, {}, np.array([box_matrix(*box)]))
+    result = drain(bake.run())
+    seconds = time.perf_counter() - started
+    point = bake.kept_gather.receivers.key % len(scene.points)
+    solver = LightSolver(bake.tracer, scene, bake.kept_gather, bake.albedo[point][:, :bake.plan.needs.channels], 1e-4, -1)
+    place = next(o.points for o in scene.objects if o.is_target)
+    return Kept(next(iter(result.objects.values())), solver, scene, bake.kept_local.transfer[place], result.report,
+                seconds)
+
+
+def held_back(tracer: Tracer, box: NDArray[np.float64], count: int, clearance: float) -> NDArray[np.float64]:
+    """Random places of the box, out of bodies and clear of surfaces."""
+    generator = np.random.default_rng(5)
+    places = generator.uniform(box[0], box[1], (50 * count, 3))
+    around = surroundings(tracer, places)
+    return places[~around.inside & (around.clearance > clearance)][:count]
+
+
+def ours(kept: Kept, lamp: LampLight, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Indirect radiance (v, 3), unit albedo: solved at the very position, by the cloud, and by the compressed cloud."""
+    exact = np.zeros((len(kept.baked.cluster), 3))
+    rows = np.full(len(kept.scene.points), -1)
+    front = kept.solver.gathered.receivers.key < len(rows)
+    rows[kept.solver.gathered.receivers.key[front]] = np.flatnonzero(front)
+    place = next(o.points for o in kept.scene.objects if o.is_target)
+
+    def take(_: slice, response: NDArray[np.float32]) -> None:
+        exact[:] = response[rows[place], 0]
+
+    drain(kept.solver.solve(position[None], take))
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    light = lamp.step([LocalLight("lamp", "point", matrix, np.full(3, POWER))]).values
+    zone = kept.baked.cluster_zone[kept.baked.cluster]
+    cloud = np.einsum("pjc,pjc->pc", *np.broadcast_arrays(kept.transfer, light[zone].astype(np.float64)))
+    constants = cluster_constants(kept.baked.bases, joined_light(kept.baked.lighting_basis, None, light),
+                                  kept.baked.cluster_zone)
+    drawn = exit_radiance(kept.baked.cluster, kept.baked.weights, constants)[:, 0]
+    return exact, cloud, drawn.astype(np.float64)
+
+
+def run(name: str, arguments: argparse.Namespace) -> list:
+    """One scene's line of the table."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    thing, box = local_scenes.SCENES[name]()
+    use_cycles(arguments.samples)
+    bpy.context.scene.render.threads = 2
+    overrides = {"lighting": "local", "cloud_lights": str(LIGHTS[name]), "cloud_emission": "1"}
+    settings = make_settings(arguments.preset, overrides | dict(s.split("=", 1) for s in arguments.set))
+    kept = baked(thing, box, settings)
+    lamp = LampLight(kept.baked.cloud, kept.solver.tracer)
+    spacing = kept.report["local"]["spacing"]
+    places = held_back(kept.solver.tracer, box, arguments.positions, 0.2 * spacing)
+    data = bpy.data.lights.new("Lamp", "POINT")
+    data.energy, data.shadow_soft_size = POWER, 0.0
+    source = bpy.data.objects.new("Lamp", data)
+    bpy.context.scene.collection.objects.link(source)
+    sums = np.zeros((4, 2))
+    for position in places:
+        source.location = position
+        solved, cloud, drawn = ours(kept, lamp, position)
+        count = len(solved)
+        first, second = (vertex_radiance(thing, {"INDIRECT"}, seed)[:count] for seed in (0, 1))
+        power = np.sum(first * second)
+        sums += [[np.sum((solved - first) * (solved - second)), power], [np.sum((cloud - solved) ** 2), power],
+                 [np.sum((drawn - cloud) ** 2), power], [np.sum((drawn - first) * (drawn - second)), power]]
+    errors = 100.0 * np.sqrt(np.maximum(sums[:, 0], 0.0) / sums[:, 1])
+    local, clusters = kept.report["local"], kept.report["clusters"]
+    return [name, len(thing.data.polygons) * 2, local["zones"], local["lights"], float(np.mean(local["merged"])),
+            clusters["count"], clusters["vectors_mean"], kept.seconds, *errors, PAPER[name]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", default="cornell,hole,bunny,maze")
+    parser.add_argument("--positions", type=int, default=20)
+    parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
+    arguments = parser.parse_args()
+    rows = []
+    for name in arguments.scenes.split(","):
+        rows.append(run(name, arguments))
+        print(rows[-1], flush=True)
+    print_table(["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "vectors, mean", "bake s",
+                 "solver %", "cloud %", "compression %", "all %", "paper: triangles, zones, lights, clusters, fps"], rows)
+
+
+if __name__ == "__main__":
+    main()

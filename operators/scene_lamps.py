@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the scene's lamps do to its baked objects: for the viewport step by step, for commands all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..prt_addon.blender.local_lights import read_local_lights
+from ..prt_addon.blender.read_scene import read_objects
+from ..prt_addon.lighting.local_lights import LocalLight
+from ..prt_addon.relighting.lamp_light import AT_ONCE, CloudLight, DirectLight, LampLight
+from ..prt_addon.scene.scene_mesh import SceneMesh
+from ..prt_addon.storage.container import BakedTransfer
+from ..prt_addon.storage.digests import digest_arrays
+from ..prt_addon.tracing.tracer import Tracer
+
+OUTSIDE = "{}: outside the light cloud, so it is shown without bounced light"
+UNLIT = "{}: too far from the light cloud's lights in sight for part of the scene's bounced light"
+
+
+@dataclass
+class SceneLamps:
+    """Lamps on baked objects. Everything that depends on geometry is kept until `forget_geometry`."""
+
+    _tracer: Tracer | None = None
+    _clouds: dict[str, LampLight] = field(default_factory=dict)
+    _lit: dict[str, CloudLight] = field(default_factory=dict)
+    _direct: dict[str, DirectLight] = field(default_factory=dict)
+
+    def forget_geometry(self) -> None:
+        """Something moved or changed its shape: shadows are to be found anew."""
+        self._tracer = None
+        self._clouds.clear()
+        self._direct.clear()
+
+    def step(self, baked: dict[str, BakedTransfer], depsgraph: bpy.types.Depsgraph,
+             warnings: list[str], seconds: float = AT_ONCE) -> list[LocalLight]:
+        """Read the lamps and let their light in each cloud follow; `cloud_light` and `direct` then tell it.
+
+        baked: objects by name; only those with a light cloud count. seconds: since the last step. Lamps that are
+        outside a cloud are named in warnings.
+        """
+        near = {name: b for name, b in baked.items() if b.cloud is not None}
+        if not near:
+            return []
+        lamps = read_local_lights(depsgraph, warnings)
+        if self._tracer is None:
+            scene = SceneMesh.assemble(read_objects(depsgraph, list(near), []), 0.0)
+            self._tracer = Tracer(scene.points, scene.triangles)
+        self._lit = {}
+        for transfer in near.values():
+            key = _cloud_key(transfer)
+            if key in self._lit:
+                continue
+            if key not in self._clouds:
+                self._clouds[key] = LampLight(transfer.cloud, self._tracer)
+            self._lit[key] = self._clouds[key].step(lamps, seconds)
+        for found in self._lit.values():
+            warnings += [OUTSIDE.format(name) for name in found.outside] + [UNLIT.format(name) for name in found.unlit]
+        return lamps
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing fades any more."""
+        return all(found.settled for found in self._lit.values())
+
+    def cloud_light(self, baked: BakedTransfer) -> NDArray[np.float32] | None:
+        """The lamps' light (zones, columns, 3) in the cloud of a bake; None without a cloud."""
+        found = self._lit.get(_cloud_key(baked)) if baked.cloud is not None else None
+        return None if found is None else found.values
+
+    def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight]) -> NDArray[np.float32] | None:
+        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud."""
+        if baked.cloud is None:
+            return None
+        if name not in self._direct:
+            self._direct[name] = DirectLight(self._tracer, baked)
+        return self._direct[name].of(lamps)
+
+
+def lamps_signature(lamps: Sequence[LocalLight]) -> Hashable:
+    """Changes when a lamp does."""
+    return tuple((lamp.key, lamp.kind, lamp.matrix.tobytes(), lamp.power.tobytes(), lamp.radius, lamp.soft_falloff,
+                  lamp.spot_angle, lamp.spot_blend, lamp.shape, lamp.size, lamp.spread, lamp.shadow) for lamp in lamps)
+
+
+def _cloud_key(baked: BakedTransfer) -> str:
+    return digest_arrays(baked.cloud.positions, baked.cloud.zone_starts, baked.cloud.dense)

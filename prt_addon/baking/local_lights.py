@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Transfer of a local light cloud's lights: placed, solved, merged zone by zone (Kristensen et al. 2005, sections 4, 5).
+
+The responses of all lights at all receivers are the largest thing of such a bake (receivers x lights x channels), so
+they go to disk as they are made, one file per zone, and one zone at a time comes back.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lighting.light_cloud import LightCloud, PlacedLights, free_space, place_lights
+from ..lighting.light_clustering import (
+    default_weights,
+    largest_response,
+    merge_lights,
+    merged_positions,
+    merged_response,
+    mutual_visibility,
+)
+from ..lighting.local_lights import LocalLight
+from ..lighting.zones import split_zones
+from ..scene.scene_mesh import SceneMesh
+from ..tracing.tracer import Tracer
+from ..transport.gather import Gather
+from ..transport.local_lights import LightSolver
+from .settings import BakeSettings
+
+# Parts of the progress that end with: the first solutions, merging (the rest: solutions at the merged places).
+SOLVED, MERGED = 0.6, 0.7
+# Order of directional emission where the scene has lamps that need one: a 45 degree spot keeps a soft direction.
+ORDER_OF_SPOTS = 3
+
+
+@dataclass(frozen=True)
+class LocalTransfer:
+    """cloud: with every zone's lights; zone: (points,) int32 of the scene's points, 0 where nothing is baked;
+    transfer: (points, columns, channels) float32, what reaches a point of the lights of its zone by at least one
+    bounce, for unit albedo, zero beyond the zone's last light; facts: for the report."""
+
+    cloud: LightCloud
+    zone: NDArray[np.int32]
+    transfer: NDArray[np.float32]
+    facts: dict[str, Any]
+
+
+def fit_to_lamps(settings: BakeSettings, lamps: Sequence[LocalLight]) -> tuple[BakeSettings, tuple[str, ...]]:
+    """The settings that a scene with these lamps asks for, and what is left out because it has none, a line each."""
+    left_out: tuple[str, ...] = ()
+    if settings.lighting == "environment,local" and not lamps and not settings.cloud_region:
+        settings = replace(settings, lighting="environment")
+        left_out = ("local lights are left out: the scene has no lamp, and no region for lamps is named",)
+    if settings.local_light and not settings.cloud_emission:
+        directed = any(lamp.kind != "point" for lamp in lamps)
+        settings = replace(settings, cloud_emission=ORDER_OF_SPOTS if directed else 1)
+    return settings, left_out
+
+
+def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, albedo: NDArray[np.float32] | None,
+                   keys: NDArray[np.int64], regions: NDArray[np.float64], settings: BakeSettings,
+                   folder: Path | None) -> Generator[float, None, LocalTransfer]:
+    """Yield progress, return the transfer.
+
+    gathered, albedo (r, channels) of its receivers: None where no light bounces; keys: points whose transfer is kept;
+    regions: (b, 4, 4) boxes of the lights, none for the scene's free space; folder: where large files may lie. Raises
+    BadScene where no light fits.
+    """
+    lights = _placed(tracer, scene, regions, settings)
+    zones = split_zones(scene.points[keys], settings.zone_receivers or max(1, len(keys)))
+    zone = np.zeros(len(scene.points), np.int32)
+    zone[keys] = zones.zone
+    order = max(1, settings.cloud_emission)
+    if gathered is None:
+        cloud = LightCloud.of_zones([lights.positions[:1]] * len(zones), lights.positions, lights.spacing, order)
+        nothing = np.zeros((len(zone), cloud.columns, 1), np.float32)
+        return LocalTransfer(cloud, zone, nothing, _facts(lights, cloud, settings))
+    members = [keys[inside] for inside in zones.members()]
+    solver = LightSolver(tracer, scene, gathered, albedo, settings.bounce_error, settings.bounces, order,
+                         settings.cloud_radius)
+    values = order ** 2 * albedo.shape[1]
+    with tempfile.TemporaryDirectory(dir=folder, prefix="responses-") as place:
+        store = _Responses(Path(place), members, gathered, len(lights), values)
+        yield from _part(solver.solve(lights.positions, store.take), 0.0, SOLVED)
+        found = []
+        for number in range(len(members)):
+            found.append(_merge(tracer, lights, store.of_zone(number), settings, albedo.shape[1]))
+            yield SOLVED + (MERGED - SOLVED) * (number + 1) / len(members)
+    cloud = LightCloud.of_zones([positions for positions, _ in found], lights.positions, lights.spacing, order,
+                                settings.cloud_radius)
+    transfer = np.zeros((len(scene.points), cloud.columns, albedo.shape[1]), np.float32)
+    missing = []
+    for number, (_, responses) in enumerate(found):
+        for light, response in enumerate(responses):
+            if response is None:
+                missing.append((number, light))
+            else:
+                columns = cloud.columns_of(number, light)
+                transfer[members[number], columns] = response.reshape(len(response), order ** 2, -1)
+    yield MERGED
+    yield from _part(_solve_again(solver, cloud, missing, members, gathered, transfer), MERGED, 1.0)
+    return LocalTransfer(cloud, zone, transfer, _facts(lights, cloud, settings))
+
+
+def packed_local(local: LocalTransfer) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Arrays and header of a finished stage."""
+    cloud = local.cloud
+    arrays = {"positions": cloud.positions, "zone_starts": cloud.zone_starts, "dense": cloud.dense, "zone": local.zone,
+              "transfer": local.transfer}
+    return arrays, {"facts": local.facts, "emission_order": cloud.emission_order, "spacing": cloud.spacing,
+                    "radius": cloud.radius}
+
+
+def unpacked_local(arrays: dict[str, NDArray], header: dict[str, Any]) -> LocalTransfer:
+    """A finished stage."""
+    cloud = LightCloud(arrays["positions"], arrays["zone_starts"], header["emission_order"], arrays["dense"],
+                       header["spacing"], header["radius"])
+    return LocalTransfer(cloud, arrays["zone"], arrays["transfer"], header["facts"])
+
+
+def _placed(tracer: Tracer, scene: SceneMesh, regions: NDArray[np.float64], settings: BakeSettings) -> PlacedLights:
+    """The lights of the dense cloud."""
+    boxes = list(regions) if len(regions) else [free_space(scene.points[np.unique(scene.triangles)])]
+    return place_lights(tracer, boxes, settings.cloud_spacing, settings.cloud_lights, radius=settings.cloud_radius)
+
+
+def _facts(lights: PlacedLights, cloud: LightCloud, settings: BakeSettings) -> dict[str, Any]:
+    """What the report tells."""
+    return {"lights": len(lights), "spacing": float(lights.spacing), "inside_bodies": lights.inside,
+            "near_surfaces": lights.near, "emission_order": cloud.emission_order, "zones": cloud.zones,
+            "merged": [int(n) for n in np.diff(cloud.zone_starts)], "columns": cloud.columns,
+            "merged_response": settings.merged_response, "warnings": list(lights.warnings)}
+
+
+class _Responses:
+    """Responses of all lights on disk, (receivers of the zone, lights, values) for each zone."""
+
+    def __init__(self, folder: Path, members: list[NDArray[np.int64]], gathered: Gather, lights: int,
+                 values: int) -> None:
+        row = np.full(int(gathered.receivers.key.max(initial=0)) + 1, -1, np.int64)
+        row[gathered.receivers.key] = np.arange(len(gathered.receivers))
+        self._rows = [row[points] for points in members]
+        self._files = [np.lib.format.open_memmap(folder / f"zone_{number}.npy", "w+", np.float32,
+                                                 (len(points), lights, values))
+                       for number, points in enumerate(members)]
+
+    def take(self, part: slice, response: NDArray[np.float32]) -> None:
+        """Write some lights' responses (r, lights * functions, channels)."""
+        for rows, file in zip(self._rows, self._files, strict=True):
+            file[:, part] = response[rows].reshape(len(rows), part.stop - part.start, -1)
+
+    def of_zone(self, number: int) -> NDArray[np.float32]:
+        """One zone's responses, in memory; its file is let go."""
+        file, self._files[number] = self._files[number], None
+        return np.array(file)
+
+
+def _merge(tracer: Tracer, lights: PlacedLights, responses: NDArray[np.float32], settings: BakeSettings, channels: int,
+           ) -> tuple[NDArray[np.float64], list[NDArray[np.float32] | None]]:
+    """A zone's merged lights: positions (n, 3) and their responses (receivers, values), None where one is to be found
+    by a new solution."""
+    positions = lights.positions
+    if settings.merge_response == 0.0 or settings.merge_distance == 0.0:
+        return positions, [responses[:, light] for light in range(len(positions))]
+    w1, w2 = default_weights(tracer.diagonal, largest_response(responses), settings.merge_distance,
+                             settings.merge_response)
+    labels = merge_lights(positions, responses, mutual_visibility(tracer, positions), w1, w2)
+    places = merged_positions(tracer, positions, labels)
+    sizes = np.bincount(labels)
+    if settings.merged_response == "harmonic":
+        merged = merged_response(responses, labels, "harmonic", channels)
+        return places, [merged[:, cluster] for cluster in range(len(places))]
+    first = np.array([np.flatnonzero(labels == cluster)[0] for cluster in range(len(places))])
+    return places, [np.array(responses[:, first[c]]) if sizes[c] == 1 else None for c in range(len(places))]
+
+
+def _solve_again(solver: LightSolver, cloud: LightCloud, missing: list[tuple[int, int]],
+                 members: list[NDArray[np.int64]], gathered: Gather, transfer: NDArray[np.float32],
+                 ) -> Generator[float]:
+    """New solutions at merged places, written into the transfer of their zones (4.1: "for higher quality")."""
+    row = np.full(len(transfer), -1, np.int64)
+    front = gathered.receivers.key < len(transfer)
+    row[gathered.receivers.key[front]] = np.flatnonzero(front)
+    functions = cloud.emission_order ** 2
+
+    def take(part: slice, response: NDArray[np.float32]) -> None:
+        for offset, (number, light) in enumerate(missing[part]):
+            values = response[row[members[number]], offset * functions:(offset + 1) * functions]
+            transfer[members[number], cloud.columns_of(number, light)] = values
+
+    places = np.array([cloud.lights_of(number)[light] for number, light in missing]).reshape(-1, 3)
+    yield from solver.solve(places, take)
+
+
+def _part(steps: Generator[float], first: float, last: float) -> Generator[float]:
+    """Progress as a part of the whole."""
+    for fraction in steps:
+        yield first + (last - first) * fraction

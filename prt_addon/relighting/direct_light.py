@@ -1,0 +1,443 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Direct light of real lamps at receivers, exact up to the sampling of soft shadows: E / pi, for unit albedo.
+
+The light clouds store bounced light only (Kristensen et al. 2005, section 3); what a lamp sends straight to a surface
+is sharper than any cloud and cheap: one shadow ray per receiver and lamp, some more for soft shadows. The unshadowed
+irradiance comes from closed forms and rays only say which share of it is seen, so a receiver in the open has no noise.
+
+Everything runs in the tracer's space (unit diagonal), where single precision serves every scene alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..basis.directions import cosine_hemisphere, tangent_frames
+from ..basis.point_sets import fibonacci_disc, fibonacci_square
+from ..lighting.local_lights import LEAST_SPREAD, LocalLight, spot_pattern, spread_pattern
+from ..linear_algebra import multiply
+from ..scene.receivers import LIFT
+from ..tracing.tracer import Tracer
+from ..transport.receiver_set import ReceiverSet
+from .source_irradiance import cap_irradiance, polygon_irradiance
+
+Single = NDArray[np.float32]
+
+# Receivers per task: their arrays stay in the cache; tasks enough for the threads at 50,000 receivers.
+BLOCK = 4096
+# A lamp nearer than this is held at it: single precision knows no smaller distance inside the scene's unit box.
+NEAREST = 6e-8
+# Points without rays by which a spot's edge across a wide lamp, and a grid's shade on an Area, are integrated.
+FINE = 192
+# Within this many half widths of an Area its irradiance comes from Lambert's formula; beyond, its points are within
+# 1e-3 of that.
+NEAR = 6.0
+# Sides of the polygon of equal area that stands for an ellipse there.
+SIDES = 24
+
+
+@dataclass(frozen=True)
+class LitReceivers:
+    """p receivers as local lights see them.
+
+    origins: (p, 3) in tracing space, where rays start; places, normals: (3, p), the same by axes, and unit normals;
+    faces: who knows the receivers' own faces, or None.
+    """
+
+    origins: Single
+    places: Single
+    normals: Single
+    faces: ReceiverSet | None = None
+
+    @staticmethod
+    def of_set(receivers: ReceiverSet) -> LitReceivers:
+        """The bake's receivers, with their faces' horizons."""
+        return LitReceivers(receivers.origins, _by_axis(receivers.origins), _by_axis(receivers.normals), receivers)
+
+    @staticmethod
+    def of_points(tracer: Tracer, positions: ArrayLike, normals: ArrayLike) -> LitReceivers:
+        """Receivers at world positions (p, 3) with unit normals (p, 3), lifted off their surface by the bake's least
+        height. On concave edges `of_set` does better: it also knows the way into the receiver's own faces."""
+        normals = np.asarray(normals, np.float64)
+        lifted = np.asarray(positions, np.float64) + (LIFT * tracer.diagonal) * normals
+        origins = tracer.to_tracing_space(lifted)
+        return LitReceivers(origins, _by_axis(origins), _by_axis(normals))
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+
+def direct_local_light(tracer: Tracer, receivers: LitReceivers | ReceiverSet, lights: Sequence[LocalLight],
+                       samples: int = 16, seed: int = 0, cutoff: float = 0.0) -> Single:
+    """E / pi (p, 3) float32 of the lamps at the receivers, in their order, shadows included.
+
+    samples: points of a lamp that throws soft shadows, fewer of one that is small from where the receivers are
+    (`sample_count`), the same for every receiver, so nothing flickers as a lamp moves; seed: turns the point sets.
+    cutoff: what a lamp would give unshadowed below this is left out (the error is at most that for each lamp). The
+    result does not depend on threads or blocks. Receivers in Morton order are traced faster.
+    """
+    if isinstance(receivers, ReceiverSet):
+        receivers = LitReceivers.of_set(receivers)
+    result = np.zeros((len(receivers), 3), np.float32)
+    sources = [_Source.of(light, tracer, receivers, samples, seed, cutoff) for light in lights]
+    sources = [source for source in sources if np.any(source.colour != 0.0)]
+    places = [slice(start, min(start + BLOCK, len(receivers))) for start in range(0, len(receivers), BLOCK)]
+    if not sources:
+        return result
+
+    def work(place: slice) -> tuple[Single, int]:
+        return _lit_block(tracer, receivers, place, sources)
+
+    for place, (light, rays) in _in_threads(tracer, work, places):
+        result[place] = light
+        tracer.rays += rays
+    return result
+
+
+def sample_count(extent: float, distance: float, samples: int) -> int:
+    """Points for a lamp of this half width seen from a typical distance: 1 for none, all of them from a tenth of the
+    distance on, at least 4 where it throws any soft shadow. The sides of a penumbra show 1 / count steps of the light,
+    and a lamp half as wide throws one half as wide."""
+    if extent <= 0.0 or samples <= 1:
+        return 1
+    return int(min(samples, max(4, math.ceil(samples * min(1.0, 10.0 * extent / max(distance, 1e-30))))))
+
+
+def _by_axis(vectors: NDArray[np.floating]) -> Single:
+    return np.ascontiguousarray(np.asarray(vectors).T, np.float32)
+
+
+def _in_threads(tracer: Tracer, work: Callable, items: list) -> Iterable:
+    """`map_in_order`, without starting threads where one would do the work (in Blender's own process none may run)."""
+    if tracer.threads == 1 or len(items) == 1:
+        return ((item, work(item)) for item in items)
+    return tracer.map_in_order(work, items)
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A lamp in tracing space. colour: (3,) float64, what one unit of `_Aimed.unshadowed` is worth; least: the smallest
+    such unit that counts; points: (n, 2) of its unit disc or square; fine: more of them."""
+
+    light: LocalLight
+    centre: Single
+    axis: Single
+    half_axes: Single
+    to_local: Single
+    radius: float
+    extent: float
+    colour: NDArray[np.float64]
+    least: float
+    points: Single
+    fine: Single
+
+    @staticmethod
+    def of(light: LocalLight, tracer: Tracer, receivers: LitReceivers, samples: int, seed: int,
+           cutoff: float) -> _Source:
+        """Bring a lamp to tracing space. Irradiance of a unit there is 1 / diagonal^2 of one in the world."""
+        centre = tracer.to_tracing_space(light.position[None])[0]
+        extent = light.extent / tracer.diagonal
+        if extent < NEAREST:
+            extent = 0.0  # thinner than single precision tells apart: a point
+        some = receivers.places[:, ::max(1, len(receivers) // 512)]
+        typical = float(np.median(_length(some - centre[:, None]))) if some.size else 0.0
+        count = sample_count(extent, typical, samples)
+        spread = fibonacci_square if light.kind == "area" and light.shape == "rectangle" else fibonacci_disc
+        # E / pi = I cos / (pi d^2), for every kind of lamp from afar
+        colour = light.peak_intensity / (math.pi * tracer.diagonal ** 2)
+        brightest = float(np.max(np.abs(colour), initial=0.0))
+        scale = float(np.sqrt(np.sum(light.to_local ** 2))) or 1.0
+        return _Source(light, centre, light.axis.astype(np.float32),
+                       (light.half_axes / tracer.diagonal).astype(np.float32),
+                       (light.to_local / scale).astype(np.float32), extent if light.kind != "area" else 0.0, extent, colour,
+                       cutoff / brightest if brightest > 0.0 else 0.0, spread(count, seed).astype(np.float32),
+                       spread(FINE, seed).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class _Aimed:
+    """Where to look for a lamp from the c receivers (indices `chosen` of the block) that it could reach.
+
+    unshadowed: (c,) what it gives in the open; directions: (n, c, 3) to its points; weights: (n, c) their share in
+    that, up to a factor for each receiver.
+    """
+
+    chosen: NDArray[np.int64]
+    unshadowed: Single
+    directions: Single
+    weights: Single
+
+
+def _lit_block(tracer: Tracer, receivers: LitReceivers, place: slice, sources: list[_Source]) -> tuple[Single, int]:
+    """E / pi (b, 3) of a block of receivers and the number of rays."""
+    places, normals = receivers.places[:, place], receivers.normals[:, place]
+    result = np.zeros((places.shape[1], 3))
+    rays = 0
+    for source in sources:
+        aimed = _aim(source, places, normals)
+        if not len(aimed.chosen):
+            continue
+        seen, traced = _seen(tracer, receivers, place, aimed, source.light.shadow)
+        rays += traced
+        result[aimed.chosen] += (aimed.unshadowed * seen)[:, None] * source.colour
+    # 1e9 W in a scene of a micrometre can leave single precision: the largest number, not infinity, which spreads NaN.
+    limit = float(np.finfo(np.float32).max)
+    return np.clip(result, -limit, limit).astype(np.float32), rays
+
+
+def _seen(tracer: Tracer, receivers: LitReceivers, place: slice, aimed: _Aimed, shadow: bool) -> tuple[Single, int]:
+    """The share (c,) of the lamp that each chosen receiver sees, and the number of rays."""
+    origins = receivers.origins[place][aimed.chosen]
+    got, whole = np.zeros(len(aimed.chosen), np.float32), np.zeros(len(aimed.chosen), np.float32)
+    rays = 0
+    for towards, weights in zip(aimed.directions, aimed.weights, strict=True):
+        whole += weights
+        kept = weights.copy()
+        if shadow:
+            lit = np.flatnonzero(kept > 0.0)
+            some = towards if len(lit) == len(kept) else towards[lit]
+            # A lamp that lies in a surface still lights the rest: rays end as far before it as they start off theirs.
+            reach = np.maximum(1.0 - LIFT / np.maximum(_length(some.T), LIFT), 0.0).astype(np.float32)
+            rays += len(lit)
+            kept[lit[tracer.occluded(origins if some is towards else origins[lit], some, reach)]] = 0.0
+        if receivers.faces is not None:
+            _weigh_by_faces(receivers.faces, aimed.chosen + place.start, towards, kept)
+        got += kept
+    return np.divide(got, whole, out=np.zeros_like(got), where=whole > 0.0), rays
+
+
+def _weigh_by_faces(receivers: ReceiverSet, chosen: NDArray[np.int64], towards: Single, weights: Single) -> None:
+    """Multiply weights (c,), in place, by the share of the receivers' faces that the directions (c, 3) lie above."""
+    lit = np.flatnonzero(weights > 0.0)
+    some = towards[lit]
+    height = np.sum(some * receivers.normals[chosen[lit]], axis=1)
+    low = lit[height < receivers.grazing[chosen[lit]] * _length(some.T)]
+    if len(low):
+        weights[low] *= receivers.above_faces(chosen[low], towards[low])
+
+
+def _aim(source: _Source, places: Single, normals: Single) -> _Aimed:
+    """What to trace for a lamp from the receivers of a block, by its kind."""
+    if source.light.kind == "area":
+        return _aim_at_face(source, places, normals)
+    towards = source.centre[:, None] - places
+    distance = np.maximum(_length(towards), NEAREST)
+    height = towards[0] * normals[0] + towards[1] * normals[1] + towards[2] * normals[2]
+    if source.radius == 0.0:
+        return _aim_at_point(source, towards, distance, height)
+    return _aim_at_sphere(source, towards, distance, height, normals)
+
+
+def _aim_at_point(source: _Source, towards: Single, distance: Single, height: Single) -> _Aimed:
+    """A lamp without extent: intensity cos / d^2."""
+    value = np.maximum(height, 0.0) / (distance * distance * distance)
+    if source.light.kind == "spot":
+        value *= _spot_share(source, towards)
+    chosen = np.flatnonzero(value > source.least)
+    value = value[chosen]
+    directions = np.ascontiguousarray(np.take(towards, chosen, axis=1).T)
+    return _Aimed(chosen, value, directions[None], np.ones((1, len(chosen)), np.float32))
+
+
+def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: Single, normals: Single) -> _Aimed:
+    """A lamp with a radius: the disc that faces the receiver, or a sphere, which looks like the disc within its rim.
+
+    Both fill a round spot of the sky of angular radius a evenly: sin^2(a) is r^2 / (d^2 + r^2) or r^2 / d^2.
+    """
+    radius = source.radius
+    soft = source.light.soft_falloff
+    square = distance.astype(np.float64) ** 2
+    sine_squared = radius ** 2 / (square + radius ** 2) if soft else np.minimum(radius ** 2 / square, 1.0)
+    value = cap_irradiance(sine_squared, np.clip(height / distance, -1.0, 1.0).astype(np.float64))
+    inside = np.zeros(len(distance), bool) if soft else distance < radius
+    value[inside] = math.pi  # the sphere shines on both sides: all around the receiver
+    value /= math.pi * radius ** 2
+    chosen = np.flatnonzero(value > source.least)
+    if not len(chosen):
+        return _nothing()
+    far, middle = distance[chosen], np.take(towards, chosen, axis=1).T
+    within = np.zeros_like(far) if soft else np.minimum(radius * radius / far, far)
+    rim = np.full_like(far, radius) if soft else radius * np.sqrt(np.maximum(1.0 - (radius / far) ** 2, 0.0))
+    frames = tangent_frames((middle / far[:, None]).astype(np.float64)).astype(np.float32)
+    to_disc = far - within
+    directions = _disc_points(frames, to_disc, rim, source.points)
+    facing = np.ascontiguousarray(np.take(normals, chosen, axis=1).T)
+    weights = _heights(directions, facing) * to_disc / _fourth_power(directions)
+    where = np.flatnonzero(inside[chosen])
+    if len(where):
+        _aim_from_inside(source, where, middle[where], facing[where], directions, weights)
+    value = value[chosen].astype(np.float32)
+    if source.light.kind == "spot":
+        outside = np.flatnonzero(~inside[chosen])  # from inside the sphere Cycles knows no cone
+        value[outside] *= _spot_edge(source, frames[outside], to_disc[outside], rim[outside], facing[outside])
+        share = _spot_share(source, directions.reshape(-1, 3).T).reshape(weights.shape)
+        share[:, where] = 1.0
+        weights = weights * share
+    return _Aimed(chosen, value, directions, weights)
+
+
+def _disc_points(frames: Single, distance: Single, radius: Single, points: Single) -> Single:
+    """Vectors (n, c, 3) from receivers to points (n, 2) of discs that face them; frames: (c, 3, 3), third row to it."""
+    middle = frames[:, 2] * distance[:, None]
+    first, second = frames[:, 0] * radius[:, None], frames[:, 1] * radius[:, None]
+    return middle + points[:, 0, None, None] * first + points[:, 1, None, None] * second
+
+
+def _aim_from_inside(source: _Source, where: NDArray[np.int64], middle: Single, normals: Single, directions: Single,
+                     weights: Single) -> None:
+    """From inside a shining sphere: look through the whole hemisphere up to the sphere. Changes entries `where`."""
+    local = cosine_hemisphere(len(directions))
+    frames = tangent_frames(normals.astype(np.float64))
+    for index, direction in enumerate(local):
+        ray = direction[0] * frames[:, 0] + direction[1] * frames[:, 1] + direction[2] * frames[:, 2]
+        along = np.sum(ray * middle, axis=1)
+        away = np.maximum(source.radius ** 2 - np.sum(middle.astype(np.float64) ** 2, axis=1), 0.0)
+        directions[index, where] = ray * (along + np.sqrt(along ** 2 + away))[:, None]
+        weights[index, where] = 1.0
+
+
+def _spot_share(source: _Source, towards: Single) -> Single:
+    """A spot's intensity towards receivers as a share of its peak; towards: (3, n), from receivers to the lamp."""
+    rows = source.to_local
+    x, y, z = (rows[k, 0] * towards[0] + rows[k, 1] * towards[1] + rows[k, 2] * towards[2] for k in range(3))
+    length = np.sqrt(x * x + y * y + z * z)
+    # towards the receiver is the other way, and the lamp looks along -Z: two signs that cancel
+    cosine = np.divide(z, length, out=np.zeros_like(length), where=length > 0.0)
+    return spot_pattern(cosine, source.light.spot_angle, source.light.spot_blend)
+
+
+def _spot_edge(source: _Source, frames: Single, distance: Single, radius: Single, normals: Single) -> Single:
+    """Mean share (c,) of a spot's light across a wide lamp, whose points the edge of the cone parts: by FINE points."""
+    got, whole = np.zeros(len(distance), np.float32), np.zeros(len(distance), np.float32)
+    for start in range(0, FINE, 16):
+        directions = _disc_points(frames, distance, radius, source.fine[start:start + 16])
+        weights = _heights(directions, normals) / _fourth_power(directions)
+        got += np.sum(weights * _spot_share(source, directions.reshape(-1, 3).T).reshape(weights.shape), axis=0)
+        whole += np.sum(weights, axis=0)
+    return np.divide(got, whole, out=np.zeros_like(got), where=whole > 0.0)
+
+
+def _aim_at_face(source: _Source, places: Single, normals: Single) -> _Aimed:
+    """An Area light: points of the part of its face whose grid opens towards the receiver."""
+    away = places - source.centre[:, None]
+    depth = source.axis[0] * away[0] + source.axis[1] * away[1] + source.axis[2] * away[2]
+    tallest = -np.sum(away * normals, axis=0)
+    for half in source.half_axes:
+        tallest += np.abs(np.sum(normals * half[:, None], axis=0))
+    chosen = np.flatnonzero((depth > 0.0) & (tallest > 0.0))
+    if not len(chosen) or source.light.area == 0.0:
+        return _nothing()
+    face = _Face.of(source, np.ascontiguousarray(np.take(away, chosen, axis=1).T), depth[chosen],
+                    np.ascontiguousarray(np.take(normals, chosen, axis=1).T))
+    directions, weights = face.look_at(source.points)
+    value = face.part * np.mean(weights, axis=0)
+    if face.narrow:
+        value = face.part * face.mean_weight(source.fine)
+    else:
+        near = np.flatnonzero(np.sum(face.away ** 2, axis=1) < (NEAR * source.extent) ** 2)
+        if len(near):
+            value[near] = face.exact(near)
+    weights = np.where(value > source.least, weights, 0.0)
+    return _Aimed(chosen, value, directions, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """The face of an Area light as c receivers see it.
+
+    away: (c, 3) from its middle to the receivers; depth: (c,) in front of its plane; middle, half: (c, 2) the rectangle
+    of the face's own coordinates (-1..1) that can be seen; part: (c,) its share of the face.
+    """
+
+    source: _Source
+    away: Single
+    depth: Single
+    normals: Single
+    middle: Single
+    half: Single
+    part: Single
+    narrow: bool
+
+    @staticmethod
+    def of(source: _Source, away: Single, depth: Single, normals: Single) -> _Face:
+        """With a grid only what lies within depth times tan(spread / 2) around a receiver's foot is seen by it."""
+        count = len(depth)
+        middle, half = np.zeros((count, 2), np.float32), np.ones((count, 2), np.float32)
+        opening = 0.5 * max(source.light.spread, LEAST_SPREAD)
+        narrow = opening < 0.5 * math.pi - 1e-6
+        size = np.sqrt(np.sum(source.half_axes.astype(np.float64) ** 2, axis=1))
+        if narrow and abs(float(np.sum(source.half_axes[0] * source.half_axes[1]))) < 1e-3 * size[0] * size[1]:
+            reach = depth * math.tan(opening)
+            for k in range(2):
+                foot = np.sum(away * source.half_axes[k], axis=1) / size[k] ** 2
+                low, high = (np.clip(foot + side * reach / size[k], -1.0, 1.0) for side in (-1.0, 1.0))
+                middle[:, k], half[:, k] = 0.5 * (low + high), 0.5 * (high - low)
+        part = half[:, 0] * half[:, 1]
+        if source.light.shape == "ellipse" and narrow:
+            part = part * (4.0 / math.pi)  # a rectangle about the ellipse; points off the ellipse weigh nothing
+        return _Face(source, away, depth, normals, middle, half, part, narrow)
+
+    def look_at(self, points: Single) -> tuple[Single, Single]:
+        """Vectors (n, c, 3) to points (n, 2) of the visible rectangle, and cos cos / d^2 (n, c) times the grid's share.
+
+        An ellipse without a grid takes its points of the unit disc as they are.
+        """
+        place = self.middle + points[:, None, :] * self.half
+        first, second = self.source.half_axes
+        directions = place[..., :1] * first + place[..., 1:] * second - self.away
+        weights = _heights(directions, self.normals) * self.depth / _fourth_power(directions)
+        if self.narrow:
+            length = np.sqrt(np.sum(directions ** 2, axis=2))
+            weights *= spread_pattern(self.depth / length, self.source.light.spread)
+            if self.source.light.shape == "ellipse":
+                weights *= np.sum(place ** 2, axis=2) <= 1.0
+        return directions, weights
+
+    def mean_weight(self, points: Single) -> Single:
+        """The mean (c,) of the weights of many points."""
+        total = np.zeros(len(self.depth), np.float32)
+        for start in range(0, len(points), 16):
+            total += np.sum(self.look_at(points[start:start + 16])[1], axis=0)
+        return total / len(points)
+
+    def exact(self, near: NDArray[np.int64]) -> Single:
+        """Irradiance of the whole face without a grid, over its area, at some receivers: by Lambert's formula."""
+        source = self.source
+        if source.light.shape == "rectangle":
+            outline, area = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]), 4.0
+        else:
+            turn = 2.0 * math.pi * np.arange(SIDES) / SIDES
+            # so much wider that the polygon has the ellipse's area
+            wide = math.sqrt(math.pi / (0.5 * SIDES * math.sin(2.0 * math.pi / SIDES)))
+            outline, area = wide * np.stack([np.cos(turn), np.sin(turn)], axis=1), math.pi
+        axes = source.half_axes.astype(np.float64)
+        corners = multiply(outline, axes)[:, None, :] - self.away[near].astype(np.float64)
+        upright = np.cross(*axes)
+        area *= math.sqrt(float(np.sum(upright ** 2)))
+        return (polygon_irradiance(corners, self.normals[near].astype(np.float64)) / area).astype(np.float32)
+
+
+def _nothing() -> _Aimed:
+    return _Aimed(np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros((1, 0, 3), np.float32),
+                  np.zeros((1, 0), np.float32))
+
+
+def _length(vectors: Single) -> Single:
+    """Lengths (n,) of vectors (3, n)."""
+    return np.sqrt(vectors[0] * vectors[0] + vectors[1] * vectors[1] + vectors[2] * vectors[2])
+
+
+def _heights(directions: Single, normals: Single) -> Single:
+    """Clamped heights (n, c) of directions (n, c, 3) above the planes of normals (c, 3)."""
+    return np.maximum(sum(directions[..., k] * normals[:, k] for k in range(3)), 0.0)
+
+
+def _fourth_power(directions: Single) -> Single:
+    """Lengths to the fourth power (n, c); held at NEAREST."""
+    square = directions[..., 0] ** 2 + directions[..., 1] ** 2 + directions[..., 2] ** 2
+    return np.maximum(square, np.float32(NEAREST ** 2)) ** 2

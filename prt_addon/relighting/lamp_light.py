@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The light of lamps on a bake: bounced in the columns of its light cloud (Kristensen et al. 2005, section 6), direct
+by shadow rays.
+
+Lamps with a surface shine into the cloud from a few points of it, each with the lamp's emission in spherical harmonics
+up to the order that the cloud was baked with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lighting.light_cloud import LightCloud
+from ..lighting.light_fading import FADE_SECONDS, FadingWeights
+from ..lighting.light_interpolation import NEAREST, CloudInterpolator
+from ..lighting.local_lights import LocalLight
+from ..tracing.tracer import Tracer
+from .direct_light import LitReceivers, direct_local_light
+from .exit_radiance import Baked
+
+# Points of a lamp with a surface, at most: its indirect light hardly tells more apart.
+MOST_POINTS = 16
+# Shadow rays from a receiver to a lamp that throws soft shadows.
+SHADOW_SAMPLES = 16
+# Seconds that count as a leap: nothing fades.
+AT_ONCE = 1e9
+
+
+@dataclass(frozen=True)
+class CloudLight:
+    """values: (zones, columns, 3) float32 of all lamps together; outside: names of lamps from which no light of the
+    cloud is in sight: they light without bounces; unlit: names of lamps that some zone can't be interpolated for;
+    settled: whether a later step without a move would change nothing."""
+
+    values: NDArray[np.float32]
+    outside: tuple[str, ...]
+    unlit: tuple[str, ...]
+    settled: bool
+
+
+class LampLight:
+    """Lamps in one light cloud, step by step in time.
+
+    tracer: of everything that hides lights from each other.
+    """
+
+    def __init__(self, cloud: LightCloud, tracer: Tracer, nearest: int = NEAREST,
+                 fade_seconds: float = FADE_SECONDS) -> None:
+        self.cloud = cloud
+        self._fading = FadingWeights(CloudInterpolator(cloud, tracer, nearest), fade_seconds)
+
+    def step(self, lamps: Sequence[LocalLight], seconds: float = AT_ONCE) -> CloudLight:
+        """Their light, so many seconds after the last step; by default as if they had always been where they are."""
+        cloud, functions = self.cloud, self.cloud.emission_order ** 2
+        shape = (cloud.zones, cloud.columns, 3)
+        names, places, emissions, keys = [], [], [], []
+        for lamp in lamps:
+            positions, shares = lamp.points(self._samples(lamp))
+            emission = lamp.emission(cloud.emission_order)
+            names += [lamp.name] * len(shares)
+            keys += [(lamp.key or lamp.name, number) for number in range(len(shares))]
+            places.append(positions)
+            emissions.append(shares[:, None, None] * emission[None])
+        if not names:
+            self._fading.step(AT_ONCE, (), np.empty((0, 3)))
+            return CloudLight(np.zeros(shape, np.float32), (), (), True)
+        found = self._fading.step(seconds, keys, np.concatenate(places))
+        # What no light of the cloud sees is not guessed at.
+        emission = np.concatenate(emissions).reshape(len(names), functions, 3) * ~found.outside[:, None, None]
+        values = found.light(emission).reshape(shape)
+        outside = _named(names, found.outside)
+        unlit = tuple(n for n in _named(names, found.unlit.any(axis=1)) if n not in outside)
+        return CloudLight(values, outside, unlit, self._fading.settled)
+
+    def _samples(self, lamp: LocalLight) -> int:
+        """Points of a lamp: as far apart as the cloud's lights."""
+        if lamp.kind != "area" or not lamp.extent > 0.0:
+            return 1
+        across = 2.0 * lamp.extent / max(self.cloud.spacing, 1e-30)
+        return int(min(MOST_POINTS, max(1, math.ceil(min(across, MOST_POINTS) ** 2))))
+
+
+def _named(names: Sequence[str], chosen: NDArray[np.bool_]) -> tuple[str, ...]:
+    """The names of the chosen ones, each once."""
+    return tuple(dict.fromkeys(name for name, taken in zip(names, chosen, strict=True) if taken))
+
+
+class DirectLight:
+    """Direct light of lamps on one bake's receivers.
+
+    tracer: of everything that casts shadows.
+    """
+
+    def __init__(self, tracer: Tracer, baked: Baked, samples: int = SHADOW_SAMPLES) -> None:
+        self._tracer, self._samples = tracer, samples
+        self._receivers = LitReceivers.of_points(tracer, baked.positions, baked.normals)
+        self._rows = baked.bases.shape[2]
+
+    def of(self, lamps: Sequence[LocalLight]) -> NDArray[np.float32]:
+        """(points, rows, 3) float32: what they add to the exit radiance, in row 0 for unit albedo."""
+        result = np.zeros((len(self._receivers), self._rows, 3), np.float32)
+        result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+        return result
