@@ -99,9 +99,9 @@ def test_point_light_over_a_plane():
     assert np.abs(directed - exact[:, None] * functions).max() < 0.01 * np.abs(exact[:, None] * functions).max()
 
 
-@pytest.mark.parametrize("albedo", [(0.5,), (0.9, 0.5, 0.0), (0.995,)])
+@pytest.mark.parametrize("albedo", [(0.5,), (0.9, 0.5, 0.0)])
 def test_light_in_the_middle_of_a_closed_sphere(albedo):
-    ball = Room(SceneMesh.assemble([sphere(radius=2.0, inward=True), speck((1.9, 0, 0))]), albedo)
+    ball = Room(SceneMesh.assemble([sphere(radius=2.0, inward=True, subdivisions=4), speck((1.9, 0, 0))]), albedo)
     wall = ball.receivers.key < ball.scene.objects[0].points.stop
     found = ball.solve([[0.0, 0.0, 0.0]])[wall, 0]
     rho = np.array(albedo)
@@ -124,6 +124,15 @@ def test_all_that_is_sent_is_absorbed(room):
         total = indirect[:, light] + room.source(position)[:, 0]
         absorbed = float(np.sum(room.area * total) * np.pi * 0.5)
         assert absorbed == pytest.approx(4 * np.pi, rel=0.04)
+
+
+def test_stiff_room_keeps_its_energy():
+    # Nearly white and closed: 200 bounces on average, so an operator that is 1e-4 off is 2 % off here.
+    white = Room(SceneMesh.assemble([box("room", (-1, -1, -1), (1, 1, 1), inward=True), speck((0.9, 0.9, 0.9))], 0.1),
+                 0.995)
+    position = (0.1, -0.2, 0.3)
+    total = white.solve(position, 1e-5)[:, 0, 0] + white.source(position)[:, 0]
+    assert float(np.sum(white.area * total) * np.pi * 0.005) == pytest.approx(4 * np.pi, rel=0.05)
 
 
 def first_bounce(room, place, normal, light, count, seed):
