@@ -68,7 +68,8 @@ def methods() -> None:
         exact = np.array([first_bounce(room, place, normal, light, 40_000, 7) for place, normal in zip(
             places, room.receivers.normals[chosen], strict=True)])
         fields = {}
-        fields["corners"] = timed(lambda light=light: drain(unit_light_direct(room.tracer, room.receivers, light[None])))
+        fields["corners"] = timed(lambda light=light: drain(
+            unit_light_direct(room.tracer, room.receivers, light[None])))
         sampled = fields["corners"][1]
 
         def conserved(light: NDArray = light, sampled: NDArray = sampled) -> NDArray:
@@ -122,7 +123,7 @@ def whole_cloud(lights: int, spacing: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lights", type=int, default=1024)
-    parser.add_argument("--spacing", type=float, default=0.0065)
+    parser.add_argument("--spacing", type=float, default=0.01)
     parser.add_argument("--methods", action="store_true")
     arguments = parser.parse_args()
     if arguments.methods:
