@@ -46,7 +46,8 @@ def unit_light_direct(tracer: Tracer, receivers: ReceiverSet, positions: NDArray
     """
     functions = emission_order ** 2
     spots = positions[:, None] + radius * _sphere(radius)[None]
-    result = np.zeros((len(receivers), len(positions) * functions), np.float32)
+    # Columns first: each task then writes whole lines of the cache.
+    result = np.zeros((len(positions) * functions, len(receivers)), np.float32)
     tasks = [(slice(start, min(start + BLOCK, len(receivers))), light) for start in range(0, len(receivers), BLOCK)
              for light in range(len(positions))]
 
@@ -54,10 +55,10 @@ def unit_light_direct(tracer: Tracer, receivers: ReceiverSet, positions: NDArray
         return _lit(tracer, receivers, task[0], spots[task[1]], emission_order)
 
     for number, ((place, light), (values, rays)) in enumerate(tracer.map_in_order(work, tasks)):
-        result[place, light * functions:(light + 1) * functions] = values
+        result[light * functions:(light + 1) * functions, place] = values.T
         tracer.rays += rays
         yield (number + 1) / len(tasks)
-    return result
+    return np.ascontiguousarray(result.T)
 
 
 def _sphere(radius: float) -> NDArray[np.float64]:
