@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from ..basis.directions import spherical_fibonacci
 from ..basis.spherical_harmonics import evaluate
+from ..linear_algebra import sparse_multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from .gather import Gather
 from .interreflection import interreflect
+from .near_light import NearTriangles
 from .receiver_set import BLOCK, ReceiverSet
 
 Single = NDArray[np.float32]
@@ -32,10 +34,6 @@ COLUMNS = 64
 NUDGE = 4e-6
 # Points of a light with a radius that stand for its sphere.
 SPHERE_POINTS = 12
-# A light nearer to a triangle than this many of its longest edges is too sharp a field for the triangle's corners.
-NEAR = 4.0
-# Most that the flux correction may change a corner: a light that sits on a vertex has no finite field there.
-MOST_CORRECTION = 1e3
 
 
 def unit_light_direct(tracer: Tracer, receivers: ReceiverSet, positions: NDArray[np.float64], emission_order: int = 1,
@@ -48,7 +46,8 @@ def unit_light_direct(tracer: Tracer, receivers: ReceiverSet, positions: NDArray
     """
     functions = emission_order ** 2
     spots = positions[:, None] + radius * _sphere(radius)[None]
-    result = np.zeros((len(receivers), len(positions) * functions), np.float32)
+    # Columns first: each task then writes whole lines of the cache.
+    result = np.zeros((len(positions) * functions, len(receivers)), np.float32)
     tasks = [(slice(start, min(start + BLOCK, len(receivers))), light) for start in range(0, len(receivers), BLOCK)
              for light in range(len(positions))]
 
@@ -56,10 +55,10 @@ def unit_light_direct(tracer: Tracer, receivers: ReceiverSet, positions: NDArray
         return _lit(tracer, receivers, task[0], spots[task[1]], emission_order)
 
     for number, ((place, light), (values, rays)) in enumerate(tracer.map_in_order(work, tasks)):
-        result[place, light * functions:(light + 1) * functions] = values
+        result[light * functions:(light + 1) * functions, place] = values.T
         tracer.rays += rays
         yield (number + 1) / len(tasks)
-    return result
+    return np.ascontiguousarray(result.T)
 
 
 def _sphere(radius: float) -> NDArray[np.float64]:
@@ -112,18 +111,45 @@ class LightSolver:
         """Yield progress; give the indirect responses to lights at positions (l, 3) to `take`, block by block."""
         functions = self.emission_order ** 2
         size = max(1, COLUMNS // functions)
+        near = NearTriangles(self.tracer, self.scene, self.gathered.receivers)
         for start in range(0, len(positions), size):
             part = slice(start, min(start + size, len(positions)))
             share = (part.stop - start) / max(1, len(positions))
             first = start / max(1, len(positions))
             direct = yield from _scaled(unit_light_direct(self.tracer, self.gathered.receivers, positions[part],
                                                           self.emission_order, self.radius), first, 0.5 * share)
-            source = conserve_flux(direct, self.scene, self.gathered.receivers, positions[part], functions, self.radius)
-            steps = interreflect(self.gathered.matrix, self.albedo, source, self.tolerance, self.bounces)
-            bounced = yield from _scaled(steps, first + 0.5 * share, 0.5 * share)
-            response = bounced.transfer
-            response -= source[:, :, None]
-            take(part, response)
+            self._conserve_flux(near, direct, positions[part])
+            yield first + 0.5 * share
+            take(part, (yield from _scaled(self._bounced(direct), first + 0.5 * share, 0.5 * share)))
+
+    def _conserve_flux(self, near: NearTriangles, direct: Single, positions: NDArray[np.float64]) -> None:
+        """Make the direct field (r, lights * functions), in place, the operator's source: see `NearTriangles`."""
+        functions = self.emission_order ** 2
+        spots = positions[:, None] + self.radius * _sphere(self.radius)[None]
+
+        def work(task: tuple[int, NDArray[np.int64]]) -> int:
+            light, triangles = task
+            columns = slice(light * functions, (light + 1) * functions)
+            return near.replace(direct[:, columns], triangles, spots[light], self.emission_order)
+
+        tasks = enumerate(near.near(positions, self.radius))
+        self.tracer.rays += sum(rays for _, rays in self.tracer.map_in_order(work, tasks))
+
+    def _bounced(self, source: Single) -> Generator[float, None, Single]:
+        """What arrives after one bounce or more, (r, columns, channels).
+
+        The series starts at the first bounce: a source may be a million times what a light on a surface sends on, and
+        taking it from the sum of both would leave nothing of single precision.
+        """
+        channels = self.albedo.shape[1]
+        result = np.zeros((*source.shape, channels), np.float32)
+        for channel in range(channels if self.bounces != 0 else 0):
+            albedo = np.ascontiguousarray(self.albedo[:, channel:channel + 1])
+            first = sparse_multiply(self.gathered.matrix, source * albedo)
+            bounced = yield from _scaled(interreflect(self.gathered.matrix, albedo, first, self.tolerance, max(
+                self.bounces - 1, -1)), channel / channels, 1.0 / channels)
+            result[:, :, channel] = bounced.transfer[:, :, 0]
+        return result
 
 
 def _scaled(steps: Generator[float, None, object], first: float, share: float) -> Generator[float, None, object]:
@@ -133,70 +159,3 @@ def _scaled(steps: Generator[float, None, object], first: float, share: float) -
             yield first + share * next(steps)
         except StopIteration as end:
             return end.value
-
-
-def conserve_flux(direct: Single, scene: SceneMesh, receivers: ReceiverSet, positions: NDArray[np.float64],
-                  functions: int, radius: float = 0.0) -> Single:
-    """The direct field (r, lights * functions) as the operator's source: with the flux that near triangles really get.
-
-    The operator interpolates between corners. Where a light is nearer to a triangle than a few of its edges that misses
-    the peak between them, or takes a corner's peak for the whole triangle. The flux of a unit light through a triangle
-    is its solid angle (Van Oosterom and Strackee 1983); a corner's value is scaled by the ratio of that to what
-    interpolation gives, over the triangles around it.
-    """
-    result = direct
-    count = len(scene.points)
-    row = np.full(2 * count, -1, np.int64)
-    row[receivers.key] = np.arange(len(receivers))
-    corners = scene.points[scene.triangles]
-    edges = np.roll(corners, -1, axis=1) - corners
-    longest = np.sqrt(np.max(np.sum(edges ** 2, axis=2), axis=1))
-    centre = corners.mean(axis=1)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    double_area = np.sqrt(np.sum(normal ** 2, axis=1))
-    normal /= np.maximum(double_area, np.finfo(np.float64).tiny)[:, None]
-    for light, position in enumerate(positions):
-        offset = position - centre
-        reach = NEAR * longest + radius
-        near = np.flatnonzero(np.sum(offset ** 2, axis=1) < reach ** 2)
-        if not len(near):
-            continue
-        for side in (0, 1):
-            facing = near[(np.sum(offset[near] * normal[near], axis=1) > 0.0) == (side == 0)]
-            rows = row[scene.triangles[facing] + side * count]
-            known = (rows >= 0).all(axis=1)
-            facing, rows = facing[known], rows[known]
-            if not len(facing):
-                continue
-            normals = (1.0 - 2.0 * side) * scene.normals[scene.triangles[facing]]
-            factor = _corrections(corners[facing] - position, normals, 0.5 * double_area[facing], rows, len(receivers))
-            touched = np.unique(rows)
-            if result is direct:
-                result = direct.copy()
-            result[touched, light * functions:(light + 1) * functions] *= factor[touched, None].astype(np.float32)
-    return result
-
-
-def _corrections(corners: NDArray[np.float64], normals: NDArray[np.float64], area: NDArray[np.float64],
-                 rows: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-    """Factors (count,) for receivers `rows` (t, 3) at the corners (t, 3, 3) of triangles, seen from the light."""
-    length = np.maximum(np.sqrt(np.sum(corners ** 2, axis=2)), 1e-30)
-    cosine = np.maximum(-np.sum(corners * normals, axis=2) / length, 0.0)
-    sampled = cosine / length ** 2 * (area / 3.0)[:, None]
-    true = solid_angles(corners, length)
-    interpolated = np.bincount(rows.ravel(), sampled.ravel(), count)
-    # Of each triangle's flux a corner gets the share that interpolation would give it.
-    share = np.divide(sampled, sampled.sum(axis=1, keepdims=True), out=np.full_like(sampled, 1.0 / 3.0),
-                      where=sampled.sum(axis=1, keepdims=True) > 0.0)
-    got = np.bincount(rows.ravel(), (share * true[:, None]).ravel(), count)
-    ratio = np.divide(got, interpolated, out=np.ones(count), where=interpolated > 0.0)
-    return np.clip(ratio, 1.0 / MOST_CORRECTION, MOST_CORRECTION)
-
-
-def solid_angles(corners: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solid angles (t,) of triangles (t, 3, 3) seen from the origin; length: (t, 3) of their corners' vectors."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    volume = np.abs(np.sum(a * np.cross(b, c), axis=1))
-    below = (length.prod(axis=1) + np.sum(a * b, axis=1) * length[:, 2] + np.sum(b * c, axis=1) * length[:, 0]
-             + np.sum(c * a, axis=1) * length[:, 1])
-    return 2.0 * np.arctan2(volume, below)
