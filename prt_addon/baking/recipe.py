@@ -26,7 +26,7 @@ from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
 from ..reporting.stages import StageTimer
-from ..scene.needs import GREY_TOLERANCE
+from ..scene.needs import BLACK, GREY_TOLERANCE
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
 from ..storage.files import intact, save_arrays
@@ -475,8 +475,9 @@ class _Bake:
         """The error budget of the diffuse rows. transfer: (p, columns, channels) before compression."""
         settings, channels = self.settings, self.plan.needs.channels
         share = np.array([part.diffuse_share for part in self.surfaces.parts])[self.scene.material]
-        keys = choose_receivers(self.open_keys[share[self.open_keys] > LEAST_DIFFUSE], settings.error_receivers,
-                                settings.seed)
+        shown = share > LEAST_DIFFUSE
+        shown &= ~self.glossy | (self.scene.albedo.max(axis=1) > BLACK)  # a metal's diffuse row is never drawn
+        keys = choose_receivers(self.open_keys[shown[self.open_keys]], settings.error_receivers, settings.seed)
         if not len(keys):
             return {}
         shape = (1, transfer.shape[1], channels)

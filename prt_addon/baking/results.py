@@ -121,7 +121,8 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
 def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: StageTimer,
               encodings: dict[str, Encoding], coherence: dict[str, Coherence], errors: dict[str, Any],
               highlight_errors: dict[str, Any], stability: list[dict[str, Any]], gathered: Gather | None,
-              bounced: Interreflection | None, light: ReferenceLight | None, resumed: list[str], seconds: float) -> dict[str, Any]:
+              bounced: Interreflection | None, light: ReferenceLight | None, resumed: list[str], seconds: float,
+              ) -> dict[str, Any]:
     """The report of design/contract.md, with what else a reader may want."""
     left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
     windowing = _windowing(light, plan.needs.order, left_out)
