@@ -26,6 +26,7 @@ from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
 from ..reporting.stages import StageTimer
+from ..reporting.wording import plural
 from ..scene.needs import BLACK, GREY_TOLERANCE
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
@@ -533,7 +534,8 @@ class _Bake:
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
         if self.filled:
-            note = f"{self.filled} receivers inside other objects take their neighbours' light"
+            note = (f"{plural(self.filled, 'receiver', 'receivers')} inside other objects"
+                    f" {'takes its' if self.filled == 1 else 'take their'} neighbours' light")
             report["scene"]["warnings"].append(note)
         objects = {
             target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],

@@ -14,7 +14,9 @@ from ..compression.coherence import Coherence, overdraw
 from ..compression.encoding import Encoding
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import remove_ringing
+from ..reporting.headline import PARTS, headline, object_errors
 from ..reporting.stages import StageTimer
+from ..reporting.wording import plural
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import CONSTANT_ROWS, BakedTransfer, hemisphere_rows, make_header
@@ -57,6 +59,10 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
         matrix=[float(v) for v in np.asarray(target.matrix).ravel()],
         settings=settings.as_dict(),
         errors={name: entry["relative_rms"] for name, entry in report["errors"].items()},
+        highlight_errors={name: entry["relative_rms"] for name, entry in report["highlight_errors"].items()},
+        own_errors={part: errors[target.name] for part in PARTS
+                    if target.name in (errors := object_errors(report, part))},
+        coherence=report["clusters"]["objects"][target.name].get("coherence"),
         seconds=report["seconds"],
     )
     points = target.points
@@ -109,8 +115,9 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
                              "ok", "rounding shows in highlights: use fewer glossy_rows"))
     for body in bodies:
         name = f"{body.material or 'material'} of {body.target}"
-        checks.append(_check(f"error of the tree over {name}, at {body.light.checked} receivers", body.light.error,
-                             0.02, "ok", "light through it is inexact"))
+        where = plural(body.light.checked, "receiver", "receivers")
+        checks.append(_check(f"error of the tree over {name}, at {where}", body.light.error, 0.02, "ok",
+                             "light through it is inexact"))
         checks.append(_check(f"energy that thin parts of {name} had to lose", float(body.light.reduced.max()), 0.05,
                              "ok", "thinner than its mean free path: the dipole does not hold there"))
         checks.append(_check(f"light that {name} loses by its sides", body.lost, LOST_LIMIT, "ok",
@@ -128,6 +135,7 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
     windowing = _windowing(light, plan.needs.order, left_out)
     stages = timer.stages
     rays = sum(int(stage["rays"]) for stage in stages)
+    measured = {"errors": errors, "highlight_errors": highlight_errors}
     return {
         "schema": REPORT_SCHEMA,
         "scene": {
@@ -145,8 +153,9 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "stages": stages,
         "left_out": [asdict(item) for item in left_out],
         "hints": list(plan.needs.hints),
-        "errors": errors,
-        "highlight_errors": highlight_errors,
+        "headline": headline(measured),
+        "covers": _covers(scene, plan, measured),
+        **measured,
         "error_metric": "relative RMS of exit radiance over random receivers and channels, under "
                         + (light.description if light is not None else "a stand-in sky (the scene has no light)"),
         "clusters": _clusters(scene, encodings, coherence),
@@ -156,6 +165,27 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "windowing": windowing,
         "resumed": list(resumed),
     }
+
+
+def _covers(scene: SceneMesh, plan: Plan, measured: dict[str, Any]) -> list[str]:
+    """What the headline's numbers speak of and what they do not, each for a person to read."""
+    found, surfaces = [], plan.surfaces
+    if measured["errors"]:
+        found.append("Diffuse: light that leaves evenly in all directions, against that light itself; what bounces off "
+                     "shiny surfaces is taken as even")
+    if measured["highlight_errors"]:
+        found.append("Highlights: over random points and views, against the highlights themselves; direct light and "
+                     "the bounces that were asked for, between shiny surfaces too")
+    if not found:
+        return found
+    targets = np.concatenate([scene.material[o.points][~scene.loose[o.points]] for o in scene.objects if o.is_target])
+    used = [surfaces.parts[number] for number in np.unique(targets)]
+    if any(part.translucent for part in used):
+        found.append("Light through translucent bodies is not part of it; its own error is among the checks")
+    if any(part.kernel is None and part.highlight.max() > 0.0 for part in used):
+        found.append("Highlights that were left out are not part of it; what was left out says how much light they "
+                     "return")
+    return found
 
 
 def _windowing(light: ReferenceLight | None, order: int, left_out: list[LeftOut]) -> dict[str, Any] | None:
@@ -191,7 +221,7 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
             found.append(LeftOut(f"the adaptive pass for {name}", "its clusters' errors are even",
                                  "redistributing vectors among clusters"))
         if used < settings.clusters:
-            why = (f"{len(encoding.cluster)} receivers fill no more" if used == most else
+            why = (f"{plural(len(encoding.cluster), 'receiver fills', 'receivers fill')} no more" if used == most else
                    f"the compression error {encoding.relative_error ** 0.5:.1e} is reached without them")
             found.append(LeftOut(f"{settings.clusters - used} of {settings.clusters} clusters of {name}", why,
                                  f"{1 - used / settings.clusters:.0%} of bases and of work per light change"))
