@@ -5,7 +5,8 @@ wheel.
     python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze] [--positions 20] [--samples 256] [--set ...]
 
 Light moves to held-back random positions; indirect light there is compared with Cycles' own vertex bake of indirect
-light, as a relative RMS over vertices, channels and positions. Cycles is baked twice with other seeds; the mean of
+light, as a relative RMS over vertices and channels, of which the mean square over positions is taken (so that no position counts
+more for being near a surface, where all is brighter). Cycles is baked twice with other seeds; the mean of
 (ours - a)(ours - b) is the squared error without Cycles' own noise. Columns: `solver`, our solution at the very
 position (rays of the operator); `cloud`, what interpolation and merging add to it; `compression`; all of it.
 """
@@ -125,19 +126,23 @@ def run(name: str, arguments: argparse.Namespace) -> list:
     kept = baked(thing, box, settings)
     lamp = LampLight(kept.baked.cloud, kept.solver.tracer)
     spacing = kept.report["local"]["spacing"]
-    places = held_back(kept.solver.tracer, box, arguments.positions, 0.2 * spacing)
+    places = held_back(kept.solver.tracer, box, arguments.positions, arguments.clearance * spacing)
     data = bpy.data.lights.new("Lamp", "POINT")
     data.energy, data.shadow_soft_size = POWER, 0.0
     source = bpy.data.objects.new("Lamp", data)
     bpy.context.scene.collection.objects.link(source)
     sums = np.zeros((4, 2))
-    for position in places:
+    clear = surroundings(kept.solver.tracer, places).clearance
+    for position, distance in zip(places, clear, strict=True):
         source.location = position
         solved, cloud, drawn = (light[kept.visible] for light in ours(kept, lamp, position))
         first, second = (vertex_radiance(thing, {"INDIRECT"}, seed)[kept.visible] for seed in (0, 1))
         power = np.sum(first * second)
-        sums += [[np.sum((solved - first) * (solved - second)), power], [np.sum((cloud - solved) ** 2), power],
-                 [np.sum((drawn - cloud) ** 2), power], [np.sum((drawn - first) * (drawn - second)), power]]
+        found = np.array([np.sum((solved - first) * (solved - second)), np.sum((cloud - solved) ** 2),
+                          np.sum((drawn - cloud) ** 2), np.sum((drawn - first) * (drawn - second))]) / power
+        print(position.round(2), f"clear by {distance:.2f} m:", *(100.0 * np.sqrt(np.maximum(found, 0.0))).round(1),
+              flush=True)
+        sums += np.stack([found, np.ones(4)], axis=1)
     errors = 100.0 * np.sqrt(np.maximum(sums[:, 0], 0.0) / sums[:, 1])
     local, clusters = kept.report["local"], kept.report["clusters"]
     return [name, len(thing.data.polygons) * 2, local["zones"], local["lights"], float(np.mean(local["merged"])),
@@ -149,6 +154,7 @@ def main() -> None:
     parser.add_argument("--scenes", default="cornell,hole,bunny,maze")
     parser.add_argument("--positions", type=int, default=20)
     parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--clearance", type=float, default=0.5, help="least distance of lights from surfaces, in spacings of the cloud")
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()

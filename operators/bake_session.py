@@ -30,6 +30,8 @@ from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
 from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import BadScene, StorageError
+from ..prt_addon.reporting.headline import PARTS, headline
+from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
@@ -79,7 +81,8 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
 def analysis_lines(analysis: dict[str, Any]) -> list[str]:
     """An analysis in a few lines for the panel."""
     lines = [f"About {analysis['seconds']:.0f} s, {analysis['peak_bytes'] / 1e6:.0f} MB while baking, "
-             f"{analysis['stored_bytes'] / 1e6:.1f} MB stored, for {analysis['receivers']:,} receivers"]
+             f"{analysis['stored_bytes'] / 1e6:.1f} MB stored, for "
+             f"{plural(analysis['receivers'], 'receiver', 'receivers')}"]
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
     return lines + analysis["hints"] + analysis["warnings"]
 
@@ -163,12 +166,14 @@ def _drop_forgotten(folder: Path) -> None:
 
 def baked_message(result: BakeResult, seconds: float) -> str:
     """What came out, in a line for the artist."""
-    names = list(result.objects)
+    names, report = list(result.objects), result.report
     what = names[0] if len(names) == 1 else f"{len(names)} objects"
-    text = f"Baked {what} in {seconds:.1f} s, {result.report['clusters']['count']} clusters"
-    errors = {name: entry["relative_rms"] for name, entry in result.report["errors"].items()}
-    if "total" in errors:
-        text += f", error {100.0 * errors['total']:.2f} %"
-    if errors.get("basis", 0.0) > 0.5 * errors.get("total", 0.0):
-        text += ", mostly because the light is sharper than the order can show"
+    text = f"Baked {what} in {seconds:.1f} s, {plural(report['clusters']['count'], 'cluster', 'clusters')}"
+    if report["errors"] or report["highlight_errors"]:
+        text += f". {headline(report)}"
+    for part, key in PARTS.items():
+        errors = {name: entry["relative_rms"] for name, entry in report[key].items()}
+        if errors.get("basis", 0.0) > 0.5 * errors.get("total", 0.0):
+            subject = "" if part == "diffuse" else ", in highlights"
+            return f"{text}, mostly because the light is sharper than the order can show{subject}"
     return text

@@ -81,6 +81,9 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     clusters: IntProperty()
     points: IntProperty()
     error: FloatProperty(default=-1.0)
+    highlight_error: FloatProperty(default=-1.0)
+    overdraw: FloatProperty()
+    overdraw_before: FloatProperty()
     stale: StringProperty()
 
 

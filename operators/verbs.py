@@ -28,6 +28,7 @@ from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import BadArguments, BadScene, StorageError
 from ..prt_addon.relighting.exit_radiance import view_radiance
 from ..prt_addon.relighting.scene_light import joined_light
+from ..prt_addon.reporting.headline import headline
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
 from ..prt_addon.storage.container import BakedTransfer
@@ -63,6 +64,7 @@ def bake(arguments: argparse.Namespace) -> Iterator[str]:
     if arguments.report is not None:
         write_report(arguments.report, result.report)
     session.discard()  # only now: until the file is saved, the finished stages are all there is
+    _tell(headline(result.report))
     yield str(arguments.output)
     if arguments.report is not None:
         yield str(arguments.report)
@@ -118,8 +120,10 @@ def report(arguments: argparse.Namespace) -> Iterator[str]:
     if not arguments.input.is_file():
         raise BadArguments(str(arguments.input), "there is no such file", "Give a report that `prt bake` wrote")
     _check_output(arguments.output, (".html", ".htm"), arguments.input)
-    page = render(read_report(arguments.input)).encode()
+    told = read_report(arguments.input)
+    page = render(told).encode()
     write_atomically(arguments.output, lambda stream: stream.write(page) and None)
+    _tell(headline(told))
     yield str(arguments.output)
 
 
@@ -163,6 +167,11 @@ ARRAYS = {
     "tangents": "(points, 3) float32, world space when baked: x of the point's frame, whose y is normal x tangent and "
                 "whose z is the normal; only where rows depend on the view",
 }
+
+
+def _tell(text: str) -> None:
+    """A line for a person; stdout carries the result only."""
+    print(f"prt: {text}", file=sys.stderr, flush=True)
 
 
 def _settings(arguments: argparse.Namespace) -> BakeSettings:

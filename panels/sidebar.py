@@ -85,16 +85,29 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
         for line in session.objects[:ROWS]:
             row = column.row()
             row.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
-            row.label(text=f"{line.points:,} receivers" if line.points else "not readable")
-            details = [f"{line.clusters} clusters"] * bool(line.clusters)
-            details += [f"error {100.0 * line.error:.2f} %"] * (line.error >= 0.0)
-            if details:
-                column.label(text=", ".join(details), icon="BLANK1")
+            row.label(text=_plural(line.points, "receiver") if line.points else "not readable")
+            for details in _details(line):
+                column.label(text=details, icon="BLANK1")
             if line.stale:
                 _wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
         if len(session.objects) > ROWS:
             column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
         layout.operator("prt.clear", icon="TRASH")
+
+
+def _details(line: bpy.types.PropertyGroup) -> list[str]:
+    """What came out for one object, in short lines."""
+    lines = [_plural(line.clusters, "cluster")] * bool(line.clusters)
+    errors = [f"{100.0 * value:.2f} % {part}"
+              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlights")) if value >= 0.0]
+    lines += [f"error {', '.join(errors)}"] * bool(errors)
+    if line.overdraw > 0.0:
+        lines.append(f"overdraw {line.overdraw_before:.2f}, coherent {line.overdraw:.2f}")
+    return lines
+
+
+def _plural(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def _targets(context: bpy.types.Context) -> str:

@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 # Views of each receiver. More views share the same number of paths.
 VIEWS = 8
 # Directions over a sun's disc that each view is lit from.
-SUN_DIRECTIONS = 16
+SUN_DIRECTIONS = 64
 # Values along a path: light at the bake's order, full light. Depths: recorded bounces, all bounces.
 BANDED, FULL = 0, 1
 RECORDED, ALL = 0, 1
@@ -73,7 +73,7 @@ class HighlightSample:
 
 
 @dataclass(frozen=True)
-class _Measured:
+class Measured:
     """Of k receivers in the two halves: band, recorded, full (2, k, views, 3) true highlights; incident (2, k, n^2, 3)
     integrals of what arrives, at the bake's order and bounces."""
 
@@ -96,9 +96,9 @@ def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: Ref
     frames = surface_frames(scene.normals[sample.keys], scene.tangents[sample.keys])
     generator = np.random.Generator(np.random.PCG64([seed, 79]))
     views = cosine_directions(lattice(len(sample.keys), VIEWS, generator)).reshape(-1, VIEWS, 3)
-    task = _Task(surfaces, receivers, frames, views, light, order, bounces, (recorded, ALL_HITS), paths, seed)
+    task = Measurement(surfaces, receivers, frames, views, light, order, bounces, (recorded, ALL_HITS), paths, seed)
     before = tracer.rays
-    measured = yield from _measure(task, scene.material[sample.keys])
+    measured = yield from measure(task, scene.material[sample.keys])
     rays = tracer.rays - before
     shown = hemisphere.evaluate(sample.functions, views.reshape(-1, 3)).reshape(*views.shape[:2], -1)
     coefficients = light.coefficients(order)
@@ -109,7 +109,7 @@ def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: Ref
     return _entries(sample, measured, baked, drawn, rows, rays, seed)
 
 
-def _entries(sample: HighlightSample, measured: _Measured, baked: Array, drawn: Array, rows: Array, rays: int,
+def _entries(sample: HighlightSample, measured: Measured, baked: Array, drawn: Array, rows: Array, rays: int,
              seed: int) -> dict[str, Any]:
     """Each step's entry; all in units of the truth, so that the squares of independent steps add up to the total's."""
     power = _product(measured.full)
@@ -149,7 +149,7 @@ def _reflected(surfaces: TrueSurfaces, material: NDArray[np.int32], incident: Ar
 
 
 @dataclass(frozen=True)
-class _Task:
+class Measurement:
     """What is measured; frames (k, 3, 3), views (k, views, 3) in them; glossy_hits: recorded and all."""
 
     surfaces: TrueSurfaces
@@ -174,7 +174,7 @@ class _Task:
         return max(16, self.paths // 4)
 
 
-def _measure(task: _Task, material: NDArray[np.int32]) -> Generator[float, None, _Measured]:
+def measure(task: Measurement, material: NDArray[np.int32]) -> Generator[float, None, Measured]:
     """Trace both halves, material by material, in parts that fit the cache."""
     size = max(1, PATHS_AT_ONCE // (VIEWS * task.of_view + task.even))
     parts = [(half, number, members[start:start + size])
@@ -182,7 +182,7 @@ def _measure(task: _Task, material: NDArray[np.int32]) -> Generator[float, None,
              for members in [np.flatnonzero(material == number)] for start in range(0, len(members), size)]
     count = len(material)
     columns = {part.kernel.shape[1] for part in task.surfaces.plan.parts if part.kernel is not None}.pop()
-    measured = _Measured(*(np.zeros((2, count, VIEWS, 3)) for _ in range(3)), np.zeros((2, count, columns, 3)))
+    measured = Measured(*(np.zeros((2, count, VIEWS, 3)) for _ in range(3)), np.zeros((2, count, columns, 3)))
     tracer = task.surfaces.tracer
 
     def trace(part: tuple[int, int, NDArray[np.int64]]) -> tuple[Array, Array, int]:
@@ -201,7 +201,7 @@ def _measure(task: _Task, material: NDArray[np.int32]) -> Generator[float, None,
     return measured
 
 
-def _trace(task: _Task, number: int, members: NDArray[np.int64], incident_order: int, seed: list[int],
+def _trace(task: Measurement, number: int, members: NDArray[np.int64], incident_order: int, seed: list[int],
            ) -> tuple[Array, Array, int]:
     """Of some receivers of one material: highlights (k, views, depths, values, 3), incident integrals (k, n^2, 3) and
     rays traced."""
@@ -222,7 +222,7 @@ def _trace(task: _Task, number: int, members: NDArray[np.int64], incident_order:
     return seen, incident, rays + more
 
 
-def _seen_by_views(task: _Task, members: NDArray[np.int64], highlight: TrueHighlight, emission, suns: DistantSuns,  # noqa: ANN001
+def _seen_by_views(task: Measurement, members: NDArray[np.int64], highlight: TrueHighlight, emission, suns: DistantSuns,  # noqa: ANN001
                    generator: np.random.Generator, seed: list[int]) -> tuple[Array, int]:
     """Highlights (k, views, depths, values, 3), paths distributed as the material reflects each view."""
     of_view, count = task.of_view, len(members) * VIEWS
@@ -233,7 +233,7 @@ def _seen_by_views(task: _Task, members: NDArray[np.int64], highlight: TrueHighl
     return arrived.reshape(len(members), VIEWS, of_view, *arrived.shape[1:]).mean(axis=2), rays
 
 
-def _incident(task: _Task, members: NDArray[np.int64], order: int, emission, suns: DistantSuns,  # noqa: ANN001
+def _incident(task: Measurement, members: NDArray[np.int64], order: int, emission, suns: DistantSuns,  # noqa: ANN001
               generator: np.random.Generator, seed: list[int]) -> tuple[Array, int]:
     """Integrals (k, order^2, 3) of the functions of `order` and what arrives at the bake's own order and bounces."""
     owner = np.repeat(members, task.even)
@@ -245,7 +245,7 @@ def _incident(task: _Task, members: NDArray[np.int64], order: int, emission, sun
     return batched_multiply(np.ascontiguousarray(functions), np.ascontiguousarray(banded)), rays
 
 
-def _arriving(task: _Task, owner: NDArray[np.int64], local: Array, weights: Array, emission, suns: DistantSuns,  # noqa: ANN001
+def _arriving(task: Measurement, owner: NDArray[np.int64], local: Array, weights: Array, emission, suns: DistantSuns,  # noqa: ANN001
               glossy_hits: tuple[int, ...], seed: list[int]) -> tuple[Array, int]:
     """Weighted radiance (n, depths, values, 3) that arrives at receivers from local directions (n, 3)."""
     directions = to_world(local, task.frames[owner]).astype(np.float32)
@@ -258,7 +258,7 @@ def _arriving(task: _Task, owner: NDArray[np.int64], local: Array, weights: Arra
     return arrived, rays
 
 
-def _add_suns(task: _Task, members: NDArray[np.int64], highlight: TrueHighlight, suns: DistantSuns, seen: Array,
+def _add_suns(task: Measurement, members: NDArray[np.int64], highlight: TrueHighlight, suns: DistantSuns, seen: Array,
               generator: np.random.Generator) -> int:
     """Add the suns that shine on the receivers themselves to the full light; returns the rays traced."""
     owner, rays = np.repeat(members, SUN_DIRECTIONS), 0

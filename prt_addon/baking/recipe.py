@@ -27,7 +27,8 @@ from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
 from ..reporting.stages import StageTimer
-from ..scene.needs import GREY_TOLERANCE
+from ..reporting.wording import plural
+from ..scene.needs import BLACK, GREY_TOLERANCE
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
 from ..storage.files import intact, save_arrays
@@ -46,9 +47,9 @@ from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
 from .plan import Plan, make_plan, most_clusters
-from .results import LocalColumns, object_container, report_of, stability_of, surface_checks
+from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
 from .settings import BakeSettings
-from .surfaces import CONSTANT, INCIDENT_ORDER, row_metric
+from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
 POLL_SECONDS = 0.05
@@ -540,8 +541,9 @@ class _Bake:
         """The error budget of the diffuse rows. transfer: (p, columns, channels) before compression."""
         settings, channels = self.settings, self.plan.needs.channels
         share = np.array([part.diffuse_share for part in self.surfaces.parts])[self.scene.material]
-        keys = choose_receivers(self.open_keys[share[self.open_keys] > LEAST_DIFFUSE], settings.error_receivers,
-                                settings.seed)
+        shown = share > LEAST_DIFFUSE
+        shown &= ~self.glossy | (self.scene.albedo.max(axis=1) > BLACK)  # a metal's diffuse row is never drawn
+        keys = choose_receivers(self.open_keys[shown[self.open_keys]], settings.error_receivers, settings.seed)
         if not len(keys):
             return {}
         shape = (1, transfer.shape[1], channels)
@@ -594,6 +596,8 @@ class _Bake:
         """errors: the budget of diffuse light and that of highlights."""
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
         stability += surface_checks(self.surfaces, bodies)
+        if self.settings.distant_light:
+            stability += white_world_checks(self._white_worlds(encodings))
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
@@ -601,7 +605,8 @@ class _Bake:
             report["local"] = self.local.facts
             report["scene"]["warnings"] += self.local.facts["warnings"]
         if self.filled:
-            note = f"{self.filled} receivers inside other objects take their neighbours' light"
+            note = (f"{plural(self.filled, 'receiver', 'receivers')} inside other objects"
+                    f" {'takes its' if self.filled == 1 else 'take their'} neighbours' light")
             report["scene"]["warnings"].append(note)
         objects = {
             target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],
@@ -610,6 +615,17 @@ class _Bake:
             for target in self.targets
         }
         return BakeResult(objects, report)
+
+    def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:
+        """Exit radiance of each object with highlights in a white world."""
+        found = {}
+        for target in self.targets:
+            functions = self.surfaces.functions_of_object(self.scene, target)
+            if len(functions) > 1:
+                solid = ~self.scene.loose[target.points]
+                found[target.name] = white_world(encodings[target.name], self.shapes[target.name], functions,
+                                                 self.scene.albedo[target.points][solid])
+        return found
 
     def _local_columns(self, name: str) -> LocalColumns | None:
         """What a container tells of its local lights."""

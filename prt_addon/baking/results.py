@@ -15,7 +15,9 @@ from ..compression.encoding import Encoding
 from ..lighting.light_cloud import LightCloud
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import remove_ringing
+from ..reporting.headline import PARTS, headline, object_errors
 from ..reporting.stages import StageTimer
+from ..reporting.wording import plural
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.columns import Columns, columns_entry
@@ -25,12 +27,14 @@ from ..transport.gather import Gather
 from ..transport.interreflection import LARGEST_ALBEDO, Interreflection
 from .plan import Plan, most_clusters
 from .settings import BakeSettings
-from .surfaces import SurfacePlan
+from .surfaces import SurfacePlan, WhiteWorld
 from .translucency import BodyLight
 
 REPORT_SCHEMA = 1
 # A white unit environment can light a surface to 1 at most; what is above is sampling error of the gather rays.
 ENERGY_LIMIT = 1.02
+# Few functions of the view overshoot a highlight's edge by up to a seventh; what they undershoot is bounded at black.
+DARKEST_VIEW, BRIGHTEST_VIEW = 0.01, 1.15
 # An object most of whose receivers see no sky and no surface that does is probably wound inwards.
 DARK_LIMIT = 0.5
 # The dipole is a half-space's: a body that loses more of its light by its sides looks like another material.
@@ -63,6 +67,10 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
         matrix=[float(v) for v in np.asarray(target.matrix).ravel()],
         settings=settings.as_dict(),
         errors={name: entry["relative_rms"] for name, entry in report["errors"].items()},
+        highlight_errors={name: entry["relative_rms"] for name, entry in report["highlight_errors"].items()},
+        own_errors={part: errors[target.name] for part in PARTS
+                    if target.name in (errors := object_errors(report, part))},
+        coherence=report["clusters"]["objects"][target.name].get("coherence"),
         seconds=report["seconds"],
     )
     points = target.points
@@ -133,8 +141,9 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
                              "ok", "rounding shows in highlights: use fewer glossy_rows"))
     for body in bodies:
         name = f"{body.material or 'material'} of {body.target}"
-        checks.append(_check(f"error of the tree over {name}, at {body.light.checked} receivers", body.light.error,
-                             0.02, "ok", "light through it is inexact"))
+        where = plural(body.light.checked, "receiver", "receivers")
+        checks.append(_check(f"error of the tree over {name}, at {where}", body.light.error, 0.02, "ok",
+                             "light through it is inexact"))
         checks.append(_check(f"energy that thin parts of {name} had to lose", float(body.light.reduced.max()), 0.05,
                              "ok", "thinner than its mean free path: the dipole does not hold there"))
         checks.append(_check(f"light that {name} loses by its sides", body.lost, LOST_LIMIT, "ok",
@@ -142,15 +151,28 @@ def surface_checks(surfaces: SurfacePlan, bodies: list[BodyLight]) -> list[dict[
     return checks
 
 
+def white_world_checks(worlds: dict[str, WhiteWorld]) -> list[dict[str, Any]]:
+    """Checks of the exit radiance of objects with highlights, by name, in a white world."""
+    checks = []
+    for name, world in worlds.items():
+        checks.append(_check(f"darkest view of {name} in a white world, below black", max(-float(world.smallest), 0.0),
+                             DARKEST_VIEW, "ok", "highlights ring: use more glossy_rows"))
+        checks.append(_check(f"brightest view of {name} in a white world", float(world.largest), BRIGHTEST_VIEW, "ok",
+                             "highlights ring: use more glossy_rows"))
+    return checks
+
+
 def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: StageTimer,
               encodings: dict[str, Encoding], coherence: dict[str, Coherence], errors: dict[str, Any],
               highlight_errors: dict[str, Any], stability: list[dict[str, Any]], gathered: Gather | None,
-              bounced: Interreflection | None, light: ReferenceLight | None, resumed: list[str], seconds: float) -> dict[str, Any]:
+              bounced: Interreflection | None, light: ReferenceLight | None, resumed: list[str], seconds: float,
+              ) -> dict[str, Any]:
     """The report of design/contract.md, with what else a reader may want."""
     left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
     windowing = _windowing(light, plan.needs.order, left_out)
     stages = timer.stages
     rays = sum(int(stage["rays"]) for stage in stages)
+    measured = {"errors": errors, "highlight_errors": highlight_errors}
     return {
         "schema": REPORT_SCHEMA,
         "scene": {
@@ -168,8 +190,9 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "stages": stages,
         "left_out": [asdict(item) for item in left_out],
         "hints": list(plan.needs.hints),
-        "errors": errors,
-        "highlight_errors": highlight_errors,
+        "headline": headline(measured),
+        "covers": _covers(scene, plan, measured),
+        **measured,
         "error_metric": "relative RMS of exit radiance over random receivers and channels, under "
                         + (light.description if light is not None else "a stand-in sky (the scene has no light)"),
         "clusters": _clusters(scene, encodings, coherence),
@@ -179,6 +202,27 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
         "windowing": windowing,
         "resumed": list(resumed),
     }
+
+
+def _covers(scene: SceneMesh, plan: Plan, measured: dict[str, Any]) -> list[str]:
+    """What the headline's numbers speak of and what they do not, each for a person to read."""
+    found, surfaces = [], plan.surfaces
+    if measured["errors"]:
+        found.append("Diffuse: light that leaves evenly in all directions, against that light itself; what bounces off "
+                     "shiny surfaces is taken as even")
+    if measured["highlight_errors"]:
+        found.append("Highlights: over random points and views, against the highlights themselves; direct light and "
+                     "the bounces that were asked for, between shiny surfaces too")
+    if not found:
+        return found
+    targets = np.concatenate([scene.material[o.points][~scene.loose[o.points]] for o in scene.objects if o.is_target])
+    used = [surfaces.parts[number] for number in np.unique(targets)]
+    if any(part.translucent for part in used):
+        found.append("Light through translucent bodies is not part of it; its own error is among the checks")
+    if any(part.kernel is None and part.highlight.max() > 0.0 for part in used):
+        found.append("Highlights that were left out are not part of it; what was left out says how much light they "
+                     "return")
+    return found
 
 
 def _windowing(light: ReferenceLight | None, order: int, left_out: list[LeftOut]) -> dict[str, Any] | None:
@@ -214,7 +258,7 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
             found.append(LeftOut(f"the adaptive pass for {name}", "its clusters' errors are even",
                                  "redistributing vectors among clusters"))
         if used < settings.clusters:
-            why = (f"{len(encoding.cluster)} receivers fill no more" if used == most else
+            why = (f"{plural(len(encoding.cluster), 'receiver fills', 'receivers fill')} no more" if used == most else
                    f"the compression error {encoding.relative_error ** 0.5:.1e} is reached without them")
             found.append(LeftOut(f"{settings.clusters - used} of {settings.clusters} clusters of {name}", why,
                                  f"{1 - used / settings.clusters:.0%} of bases and of work per light change"))

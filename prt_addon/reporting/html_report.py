@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from . import svg_plots, wording
+from .headline import headline, object_errors
 from .svg_plots import percent
 from .wording import count, duration, memory, number, plural
 
@@ -58,12 +59,12 @@ def _table(headings: Sequence[tuple[str, bool]], rows: Iterable[Sequence[str]]) 
 
 def _head(report: Report) -> str:
     """One sentence that says how it went, and the main numbers."""
-    scene, total = report["scene"], report["errors"].get("total")
+    scene = report["scene"]
     objects = plural(len(scene["objects"]), "object", "objects")
     lead = f"Baked {objects} with {plural(scene['receivers'], 'point', 'points')} in {duration(report['seconds'])}."
-    if total and total["relative_rms"] is not None:
-        lead += f" The picture differs from a full light simulation by {percent(total['relative_rms'])}."
-    elif not report["errors"]:
+    if report["errors"] or report.get("highlight_errors"):
+        lead += f" {headline(report)}."
+    else:
         lead += " The error was not measured (error_receivers is 0)."
     cards = (
         (duration(report["seconds"]), "for the whole bake"),
@@ -115,26 +116,50 @@ def _times(report: Report) -> str:
 
 
 def _errors(report: Report) -> str:
-    """The error budget: a plot with intervals and what to do about each part."""
+    """The error budgets: plots with intervals and what to do about each part, objects, and what is not in them."""
+    parts = []
+    for title, key, words in (("Diffuse light", "errors", wording.ERRORS),
+                              ("Highlights", "highlight_errors", wording.HIGHLIGHT_ERRORS)):
+        if report.get(key):
+            parts += [f"<h3>{title}</h3>", *_budget(report[key], words, title)]
+    if not parts:
+        return _section("How right is the picture?", "<p>Not measured: the bake was asked for no reference rays.</p>")
+    metric = report.get("error_metric")
+    metric_line = f'<p class="why below">Each number: {escape(str(metric))}.</p>' if metric else ""
+    covers = "".join(f"<li>{escape(str(line))}</li>" for line in report.get("covers") or [])
+    return _section("How right is the picture?", *parts, _errors_of_objects(report), metric_line,
+                    f'<ul class="why">{covers}</ul>' if covers else "")
+
+
+def _budget(errors: dict[str, Any], wording_of: dict[str, tuple[str, str, str]], title: str) -> list[str]:
+    """One budget: how it was measured, its plot, and what each cause is."""
     rows, words = [], []
-    for name, (label, meaning, remedy) in wording.ERRORS.items():
-        entry = report["errors"].get(name)
+    for name, (label, meaning, remedy) in wording_of.items():
+        entry = errors.get(name)
         if entry is None or entry["relative_rms"] is None:
             continue
         low, high = (entry["relative_rms"] if end is None else end for end in entry["interval"])
         rows.append(svg_plots.Interval(label, entry["relative_rms"], low, high))
         advice = f" Smaller with {remedy}." if remedy else ""
         words.append(f"<dt>{escape(label)}</dt><dd>{escape(meaning)}.{escape(advice)}</dd>")
-    if not rows:
-        return _section("How right is the picture?", "<p>Not measured: the bake was asked for no reference rays.</p>")
-    largest = report["errors"]["total"]
+    largest = errors["total"]
     measured = (f"Measured at {plural(largest['receivers'], 'random point', 'random points')} with "
                 f"{count(largest['reference_rays'])} independent rays. Dot: measured value; line: its 95 % interval.")
-    metric = report.get("error_metric")
-    metric_line = f'<p class="why below">Each number: {escape(str(metric))}.</p>' if metric else ""
-    plot = svg_plots.intervals(rows, wording.ZONES, "Relative error by cause with 95 % intervals")
-    return _section("How right is the picture?", f'<p class="why">{escape(measured)}</p>', plot,
-                    f"<dl>{''.join(words)}</dl>", metric_line)
+    plot = svg_plots.intervals(rows, wording.ZONES, f"{title}: relative error by cause with 95 % intervals") \
+        if rows else ""
+    return [f'<p class="why">{escape(measured)}</p>', plot, f"<dl>{''.join(words)}</dl>"]
+
+
+def _errors_of_objects(report: Report) -> str:
+    """A table of objects, where several were measured."""
+    found = {part: object_errors(report, part) for part in ("diffuse", "highlights")}
+    names = list(dict.fromkeys(name for errors in found.values() for name in errors))
+    if len(names) < 2:
+        return ""
+    names.sort(key=lambda name: -max(errors.get(name, 0.0) for errors in found.values()))
+    rows = [[escape(name), *(percent(errors[name]) if name in errors else "" for errors in found.values())]
+            for name in names]
+    return "<h3>Object by object</h3>" + _table((("Object", False), ("Diffuse", True), ("Highlights", True)), rows)
 
 
 def _left_out(report: Report) -> str:
@@ -164,7 +189,28 @@ def _compression(report: Report) -> str:
                             "seconds of compressing the object", "relative error of the compressed data",
                             "Error of the compression over time")
     heading = "<h3>Error while compressing</h3>" if plot else ""
-    return _section("Compression", intro, table, heading, plot)
+    return _section("Compression", intro, table, _coherence(objects), heading, plot)
+
+
+def _coherence(objects: dict[str, dict[str, Any]]) -> str:
+    """What reclassification and superclusters brought, where the bake was asked for coherence."""
+    told = {name: o["coherence"] for name, o in objects.items() if o.get("coherence")}
+    if not told:
+        return ""
+    intro = ('<p class="why">Points at the borders of clusters were moved to a neighbouring one so that fewer '
+             "triangles lie in more than one. The preview draws all clusters in one pass and gains nothing; export and "
+             "renderers that draw cluster by cluster do. Overdraw:</p>")
+    rows = [[escape(name), *(number(c[key]) for key in ("before", "reclassified", "superclustered", "both")),
+             count(c["moved"]), percent(_spent(c))] for name, c in told.items()]
+    heads = [("Object", False), *((text, True) for text in ("Before", "Points moved", "Superclusters", "Both",
+                                                            "Moved", "Error spent"))]
+    return f"<h3>Coherence</h3>{intro}{_table(heads, rows)}"
+
+
+def _spent(coherence: dict[str, Any]) -> float:
+    """Share of the squared error that was added; none where there was no error to begin with."""
+    before = coherence["squared_error_before"]
+    return max(coherence["squared_error_after"] / before - 1.0, 0.0) if before else 0.0
 
 
 def _short(name: str) -> str:

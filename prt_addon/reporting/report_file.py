@@ -31,6 +31,8 @@ _SHAPE: dict[str, Any] = {
 }
 # `errors` is empty where the reference was switched off, else it holds all four.
 ERROR_NAMES = ("sampling", "basis", "compression", "total")
+# `highlight_errors` is absent or empty where no highlight was baked or measured, else it holds all six.
+HIGHLIGHT_ERROR_NAMES = ("sampling", "rows", "basis", "bounces", "compression", "total")
 _ERROR_SHAPE: dict[str, Any] = {"relative_rms": NUMBER, "interval": list, "receivers": int, "reference_rays": int}
 
 
@@ -43,11 +45,15 @@ def problem_of(report: Any) -> str | None:
     problem = _mismatch(report, _SHAPE, "")
     if problem is None and report["errors"]:
         problem = _mismatch(report["errors"], dict.fromkeys(ERROR_NAMES, _ERROR_SHAPE), "errors.")
+    if problem is None and report.get("highlight_errors"):
+        problem = _mismatch(report["highlight_errors"], dict.fromkeys(HIGHLIGHT_ERROR_NAMES, _ERROR_SHAPE),
+                            "highlight_errors.")
     if problem is None:
-        for name, entry in report["errors"].items():
-            interval = entry["interval"]
-            if len(interval) != 2 or not all(isinstance(end, NUMBER) for end in interval):
-                return f"errors.{name}.interval: not two numbers"
+        for key in ("errors", "highlight_errors"):
+            for name, entry in (report.get(key) or {}).items():
+                interval = entry["interval"]
+                if len(interval) != 2 or not all(isinstance(end, NUMBER) for end in interval):
+                    return f"{key}.{name}.interval: not two numbers"
     return problem
 
 

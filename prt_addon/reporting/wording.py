@@ -27,6 +27,21 @@ ERRORS = {
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
 }
 
+# The same for highlights.
+HIGHLIGHT_ERRORS = {
+    "total": ("All together", "the highlights that the preview shows, against a full simulation with the materials' "
+              "own reflection", ""),
+    "sampling": ("Ray sampling", "a limited number of rays stands for all directions",
+                 "more directions and gather_directions, or a higher preset"),
+    "rows": ("Soft view", "how a highlight changes with the direction of view is stored as a smooth function",
+             "more glossy_rows"),
+    "basis": ("Soft lighting", "the light is stored as a smooth sky of limited detail, so reflections are blurred, and "
+              "those of small bright lights most", "a higher order"),
+    "bounces": ("Reflections in reflections", "shiny surfaces show each other once; in what they show, further "
+                "reflections are spread evenly", ""),
+    "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
+}
+
 # Upper end of each zone on the error plot and its name; a relative RMS of 1 % is about 2.5 of 255 grey levels at most.
 ZONES = ((0.01, "hard to see"), (0.05, "slight"), (1.0, "visible"))
 
@@ -43,6 +58,8 @@ GLOSSARY = (
     ("Cluster", "a group of points that react to light alike. Each point is described by its cluster's mean and a few "
      "weights for the cluster's vectors, which takes much less memory than storing everything for every point."),
     ("Overdraw", "how often the mesh's triangles would be drawn if each cluster were drawn on its own; 1 is best."),
+    ("Supercluster", "several clusters that an old graphics card could hold at once and draw as one."),
+    ("Highlight", "the light that a surface reflects like a blurred mirror: it changes with the direction of view."),
 )
 
 
