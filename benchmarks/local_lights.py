@@ -5,9 +5,9 @@ wheel.
     python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze] [--positions 20] [--samples 256] [--set ...]
 
 Light moves to held-back random positions; indirect light there is compared with Cycles' own vertex bake of indirect
-light, as a relative RMS over vertices and channels, of which the mean square over positions is taken (so that no position counts
-more for being near a surface, where all is brighter). Cycles is baked twice with other seeds; the mean of
-(ours - a)(ours - b) is the squared error without Cycles' own noise. Columns: `solver`, our solution at the very
+light, as a relative RMS over vertices and channels, of which the mean square over positions is taken (so that no
+position counts more for being near a surface, where all is brighter). Cycles is baked twice with other seeds; the mean
+of (ours - a)(ours - b) is the squared error without Cycles' own noise. Columns: `solver`, our solution at the very
 position (rays of the operator); `cloud`, what interpolation and merging add to it; `compression`; all of it.
 """
 
@@ -77,7 +77,8 @@ def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSetti
     result = drain(bake.run())
     seconds = time.perf_counter() - started
     point = bake.kept_gather.receivers.key % len(scene.points)
-    solver = LightSolver(bake.tracer, scene, bake.kept_gather, bake.albedo[point][:, :bake.plan.needs.channels], 1e-4, -1)
+    albedo = bake.albedo[point][:, :bake.plan.needs.channels]
+    solver = LightSolver(bake.tracer, scene, bake.kept_gather, albedo, 1e-4, -1)
     place = next(o.points for o in scene.objects if o.is_target)
     visible = bake.open_keys[(bake.open_keys >= place.start) & (bake.open_keys < place.stop)] - place.start
     return Kept(next(iter(result.objects.values())), solver, scene, bake.kept_local.transfer[place], result.report,
@@ -154,7 +155,8 @@ def main() -> None:
     parser.add_argument("--scenes", default="cornell,hole,bunny,maze")
     parser.add_argument("--positions", type=int, default=20)
     parser.add_argument("--samples", type=int, default=256)
-    parser.add_argument("--clearance", type=float, default=0.5, help="least distance of lights from surfaces, in spacings of the cloud")
+    parser.add_argument("--clearance", type=float, default=0.5,
+                        help="least distance of lights from surfaces, in spacings of the cloud")
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
@@ -163,7 +165,8 @@ def main() -> None:
         rows.append(run(name, arguments))
         print(rows[-1], flush=True)
     print_table(["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "vectors, mean", "bake s",
-                 "solver %", "cloud %", "compression %", "all %", "paper: triangles, zones, lights, clusters, fps"], rows)
+                 "solver %", "cloud %", "compression %", "all %", "paper: triangles, zones, lights, clusters, fps"],
+                rows)
 
 
 if __name__ == "__main__":

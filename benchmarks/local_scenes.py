@@ -90,7 +90,8 @@ def room(low: ArrayLike, high: ArrayLike, cells: int, colours: dict[str, tuple[f
     return [panel for side, panel in sides.items() if side in colours]
 
 
-def block(centre: ArrayLike, size: ArrayLike, turn: float, cells: int, colour: tuple[float, float, float]) -> list[Panel]:
+def block(centre: ArrayLike, size: ArrayLike, turn: float, cells: int,
+          colour: tuple[float, float, float]) -> list[Panel]:
     """The outside of a box that stands on the floor, turned about z (radians): no bottom."""
     half = 0.5 * np.asarray(size, np.float64)
     across = np.array([np.cos(turn), np.sin(turn), 0.0])
@@ -115,7 +116,7 @@ def cornell() -> tuple[bpy.types.Object, NDArray[np.float64]]:
 
 
 def cornell_with_hole() -> tuple[bpy.types.Object, NDArray[np.float64]]:
-    """The closed box with a hole in its left wall, lit through it from an open space at its left, about 5k triangles."""
+    """The closed box with a hole in its left wall, lit through it from open space at its left; about 5k triangles."""
     hole = frozenset((i, j) for i in range(7, 12) for j in range(8, 14))
     panels = room((-1, -1, 0), (1, 1, 2), 18, {**CORNELL, "front": WHITE}, hole)
     panels += [p for place, size, turn in BLOCKS for p in block(place, size, turn, 8, WHITE)]

@@ -35,8 +35,8 @@ class DrawItem:
 
     key: changes when `baked` does (`transfer_signature(baked)`, or anything hashable and cheaper that does).
     matrix: (4, 4), from world space at bake time to world space now: current matrix_world @ inverse(matrix at bake).
-    light: (columns, 3), coefficients in the lighting basis of the bake, or (zones, columns, 3) where a light cloud takes
-        part (`relighting.scene_light.joined_light`); more columns than a bake for distant light has are left out
+    light: (columns, 3), coefficients in the lighting basis of the bake, or (zones, columns, 3) where a light cloud
+        takes part (`relighting.scene_light.joined_light`); more columns than a bake for distant light has are left out
         (spherical harmonics of a higher order).
     direct: (points, rows, 3) float32, what lamps add to the exit radiance: their direct light, which no bake holds.
         Never changed in place: another array means other light.

@@ -144,7 +144,8 @@ def _add_relight(group: argparse._SubParsersAction) -> None:
     parser.add_argument("--input", type=Path, required=True, metavar="FILE.blend")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.npz")
     _add_light_options(parser)
-    parser.add_argument("--use-scene-lights", action="store_true", help="add the scene's Suns to the environment, and its lamps where they were baked for")
+    parser.add_argument("--use-scene-lights", action="store_true",
+                        help="add the scene's Suns to the environment, and its lamps where a light cloud was baked")
 
 
 def _add_preview(group: argparse._SubParsersAction) -> None:

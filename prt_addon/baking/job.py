@@ -38,7 +38,8 @@ def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: Refer
               digests: dict[str, str] | None = None, regions: NDArray[np.float64] | None = None) -> Path:
     """Write the input of a bake into its folder below `root` and return the folder; finished stages there stay.
 
-    digests: of the geometry by object name, kept in the headers. regions: of local lights, see `bake`. Raises StorageError where `root` can't be written.
+    digests: of the geometry by object name, kept in the headers. regions: of local lights, see `bake`. Raises
+    StorageError where `root` can't be written.
     """
     arrays = {name: getattr(scene, name) for name in _SCENE_ARRAYS}
     arrays["regions"] = np.empty((0, 4, 4)) if regions is None else regions

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Transfer of a local light cloud's lights: placed, solved, merged zone by zone (Kristensen et al. 2005, sections 4, 5).
+"""Transfer of a light cloud's lights: placed, solved, merged zone by zone (Kristensen et al. 2005, sections 4, 5).
 
 The responses of all lights at all receivers are the largest thing of such a bake (receivers x lights x channels), so
 they go to disk as they are made, one file per zone, and one zone at a time comes back.

@@ -105,13 +105,14 @@ class BakeSettings:
 
 
 PRESETS: dict[str, BakeSettings] = {
-    "draft": BakeSettings(order=4, cloud_lights=64, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
-                          encoder="static", compression_error=1e-2, spacing=1.0 / 32.0, error_receivers=32,
-                          error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
+    "draft": BakeSettings(order=4, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
+                          cloud_lights=64, encoder="static", compression_error=1e-2, spacing=1.0 / 32.0,
+                          error_receivers=32, error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
     "standard": BakeSettings(),
-    "high": BakeSettings(order=7, cloud_lights=512, merge_response=0.02, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
-                         encoder="adaptive", compression_error=5e-4, spacing=1.0 / 128.0, error_receivers=128,
-                         error_paths=16384, glossy_rows=24, glossy_albedo=0.03),
+    "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
+                         cloud_lights=512, merge_response=0.02, encoder="adaptive", compression_error=5e-4,
+                         spacing=1.0 / 128.0, error_receivers=128, error_paths=16384, glossy_rows=24,
+                         glossy_albedo=0.03),
 }
 
 # Inclusive limits of each number, and why there is a limit at all.

@@ -55,7 +55,8 @@ def light_coefficients(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, o
 
     environment_override: an equirectangular file in place of the World. rotate_degrees: a further Z rotation, as the
     World's Mapping node (type Point) means it; Suns do not turn along. use_scene_lights: with Suns. window: take the
-    ringing out where the light rings. name_lamps: warn of lamps near the scene, which are no part of this. Raises PRTError naming a missing or broken image.
+    ringing out where the light rings. name_lamps: warn of lamps near the scene, which are no part of this.
+    Raises PRTError naming a missing or broken image.
     """
     environment = _environment(scene, depsgraph, environment_override)
     warnings = list(environment.warnings)

@@ -154,8 +154,8 @@ class _Source:
         scale = float(np.sqrt(np.sum(light.to_local ** 2))) or 1.0
         return _Source(light, centre, light.axis.astype(np.float32),
                        (light.half_axes / tracer.diagonal).astype(np.float32),
-                       (light.to_local / scale).astype(np.float32), extent if light.kind != "area" else 0.0, extent, colour,
-                       cutoff / brightest if brightest > 0.0 else 0.0, spread(count, seed).astype(np.float32),
+                       (light.to_local / scale).astype(np.float32), extent if light.kind != "area" else 0.0, extent,
+                       colour, cutoff / brightest if brightest > 0.0 else 0.0, spread(count, seed).astype(np.float32),
                        spread(FINE, seed).astype(np.float32))
 
 
