@@ -47,7 +47,7 @@ class BakeSettings:
     cloud_lights: most lights of the dense cloud (Kristensen 2005, section 4); each is one more global illumination
         solution. cloud_spacing: metres between them instead; 0 = as cloud_lights allow.
     cloud_emission: order of the spherical harmonics of a light's directional emission, for spots and area lights
-        (columns grow with its square); 0 = 1 where the scene has only Point lights, else 3.
+        (columns grow with its square); 0 = 1 where the scene has only Point lights, else 2.
     cloud_radius: metres; lights are diffuse spheres of this radius; 0 = points.
     zone_receivers: most receivers of a zone, in which lights merge for themselves (4.2); 0 = one zone.
     merge_distance: as a fraction of the scene's diagonal, above which two lights never merge (the inverse of w1).
@@ -85,7 +85,7 @@ class BakeSettings:
     zone_receivers: int = 4096
     merge_distance: float = 0.5
     merge_response: float = 0.05
-    merged_response: str = "solution"
+    merged_response: str = "harmonic"
     threads: int = 0
     seed: int = 1
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..basis.directions import spherical_fibonacci
 from ..basis.spherical_harmonics import evaluate
-from ..linear_algebra import sparse_multiply
+from ..linear_algebra import multiply, small_symmetric_eigenpairs, sparse_multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from .gather import Gather
@@ -28,8 +28,11 @@ Single = NDArray[np.float32]
 # What takes the lights of a slice and their responses (r, lights * functions, channels), in the receivers' order.
 Consumer = Callable[[slice, Single], None]
 
-# Columns carried through the operator at once: 64 of 50,000 receivers and three channels are 38 MB a copy.
-COLUMNS = 64
+# Columns carried through the operator at once: 256 of 50,000 receivers and three channels are 154 MB. The more there are,
+# the more of what they do after their first bounce is alike.
+COLUMNS = 256
+# Bounces after the first that are compressed anew before the rest goes on as it is.
+COMPRESSED_BOUNCES = 3
 # Rays to a light end this far before it, as a fraction of the scene's diagonal: a light on a surface is not hidden.
 NUDGE = 4e-6
 # Points of a light with a radius that stand for its sphere.
@@ -146,10 +149,49 @@ class LightSolver:
         for channel in range(channels if self.bounces != 0 else 0):
             albedo = np.ascontiguousarray(self.albedo[:, channel:channel + 1])
             first = sparse_multiply(self.gathered.matrix, source * albedo)
-            bounced = yield from _scaled(interreflect(self.gathered.matrix, albedo, first, self.tolerance, max(
-                self.bounces - 1, -1)), channel / channels, 1.0 / channels)
-            result[:, :, channel] = bounced.transfer[:, :, 0]
+            result[:, :, channel] = first
+            if self.bounces != 1:
+                result[:, :, channel] += yield from _scaled(self._later(first, albedo), channel / channels,
+                                                            1.0 / channels)
         return result
+
+    def _later(self, first: Single, albedo: Single) -> Generator[float, None, Single]:
+        """What arrives after two bounces or more (r, columns), of one channel.
+
+        Each bounce blurs: after the first, and more so after the second, many lights differ by a few fields only. So
+        these bounce on, the leading axes of the columns (of equal length, so that a faint light counts as much), as
+        many as leave out less than the tolerance of the first bounce's energy.
+        """
+        length = np.sqrt(np.sum(np.square(first, dtype=np.float64), axis=0))
+        scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0.0)
+        term, shares = first * scale.astype(np.float32), np.eye(first.shape[1], dtype=np.float32)
+        energy = float(np.count_nonzero(scale))  # of columns of unit length
+        total = np.zeros_like(first)
+        left = np.inf if self.bounces < 0 else self.bounces - 1
+        for step in range(int(min(COMPRESSED_BOUNCES, left))):
+            term, shares = _leading(term, shares, self.tolerance ** 2 * energy)
+            term = sparse_multiply(self.gathered.matrix, term * albedo)
+            multiply(term, shares, out=total, accumulate=True)
+            yield (step + 1) / (COMPRESSED_BOUNCES + 1)
+        term, shares = _leading(term, shares, self.tolerance ** 2 * energy)
+        if left > COMPRESSED_BOUNCES and shares.shape[0]:
+            now = float(np.sum(np.square(term, dtype=np.float64)))
+            tolerance = min(1.0, self.tolerance * np.sqrt(energy / now)) if now > 0.0 else 1.0
+            bounces = -1 if self.bounces < 0 else int(left) - COMPRESSED_BOUNCES
+            bounced = yield from interreflect(self.gathered.matrix, albedo, term, tolerance, bounces)
+            multiply(bounced.transfer[:, :, 0] - term, shares, out=total, accumulate=True)
+        return total * length.astype(np.float32)
+
+
+def _leading(term: Single, shares: Single, least: float) -> tuple[Single, Single]:
+    """Axes (r, k) and shares (k, columns) of the fields term (r, m) times shares (m, columns), without the axes that
+    together hold less energy than `least`."""
+    gram = multiply(multiply(shares.T, multiply(term.T, term)), shares).astype(np.float64)
+    energies, axes = small_symmetric_eigenpairs(0.5 * (gram + gram.T))
+    order = np.argsort(energies)
+    kept = order[np.cumsum(np.maximum(energies[order], 0.0)) > least]
+    axes = np.ascontiguousarray(axes[:, kept], np.float32)
+    return multiply(term, multiply(shares, axes)), np.ascontiguousarray(axes.T)
 
 
 def _scaled(steps: Generator[float, None, object], first: float, share: float) -> Generator[float, None, object]:
