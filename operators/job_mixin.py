@@ -27,6 +27,7 @@ STAGES = {
     "interreflection": "Bounced light",
     "glossy": "Highlights",
     "subsurface": "Light through bodies",
+    "local": "Light of lamps",
     "encode": "Compressing",
     "errors": "Measuring the error",
 }

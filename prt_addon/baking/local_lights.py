@@ -31,12 +31,13 @@ from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.gather import Gather
 from ..transport.local_lights import LightSolver
+from .local_budget import Probes, probe_positions
 from .settings import BakeSettings
 
 # Parts of the progress that end with: the first solutions, merging (the rest: solutions at the merged places).
-SOLVED, MERGED = 0.6, 0.7
-# Order of directional emission where the scene has lamps that need one: it costs four times an isotropic cloud, and tells
-# a spot's light before it from that behind it.
+SOLVED, MERGED, PROBED = 0.6, 0.7, 0.95
+# Order of directional emission where the scene has lamps that need one: it costs four times an isotropic cloud, and
+# tells a spot's light before it from that behind it.
 ORDER_OF_SPOTS = 2
 
 
@@ -44,12 +45,14 @@ ORDER_OF_SPOTS = 2
 class LocalTransfer:
     """cloud: with every zone's lights; zone: (points,) int32 of the scene's points, 0 where nothing is baked;
     transfer: (points, columns, channels) float32, what reaches a point of the lights of its zone by at least one
-    bounce, for unit albedo, zero beyond the zone's last light; facts: for the report."""
+    bounce, for unit albedo, zero beyond the zone's last light; facts: for the report; probes: for the
+    error budget."""
 
     cloud: LightCloud
     zone: NDArray[np.int32]
     transfer: NDArray[np.float32]
     facts: dict[str, Any]
+    probes: Probes | None = None
 
 
 def fit_to_lamps(settings: BakeSettings, lamps: Sequence[LocalLight]) -> tuple[BakeSettings, tuple[str, ...]]:
@@ -105,8 +108,11 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
                 columns = cloud.columns_of(number, light)
                 transfer[members[number], columns] = response.reshape(len(response), order ** 2, -1)
     yield MERGED
-    yield from _part(_solve_again(solver, cloud, missing, members, gathered, transfer), MERGED, 1.0)
-    return LocalTransfer(cloud, zone, transfer, _facts(lights, cloud, settings))
+    yield from _part(_solve_again(solver, cloud, missing, members, gathered, transfer), MERGED, PROBED)
+    probes = None
+    if settings.error_receivers:
+        probes = yield from _part(_probes(solver, cloud, gathered, len(transfer), settings.seed), PROBED, 1.0)
+    return LocalTransfer(cloud, zone, transfer, _facts(lights, cloud, settings), probes)
 
 
 def packed_local(local: LocalTransfer) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -114,6 +120,8 @@ def packed_local(local: LocalTransfer) -> tuple[dict[str, NDArray], dict[str, An
     cloud = local.cloud
     arrays = {"positions": cloud.positions, "zone_starts": cloud.zone_starts, "dense": cloud.dense, "zone": local.zone,
               "transfer": local.transfer}
+    if local.probes is not None:
+        arrays |= {"probe_positions": local.probes.positions, "probe_responses": local.probes.responses}
     return arrays, {"facts": local.facts, "emission_order": cloud.emission_order, "spacing": cloud.spacing,
                     "radius": cloud.radius}
 
@@ -122,7 +130,8 @@ def unpacked_local(arrays: dict[str, NDArray], header: dict[str, Any]) -> LocalT
     """A finished stage."""
     cloud = LightCloud(arrays["positions"], arrays["zone_starts"], header["emission_order"], arrays["dense"],
                        header["spacing"], header["radius"])
-    return LocalTransfer(cloud, arrays["zone"], arrays["transfer"], header["facts"])
+    probes = Probes(arrays["probe_positions"], arrays["probe_responses"]) if "probe_positions" in arrays else None
+    return LocalTransfer(cloud, arrays["zone"], arrays["transfer"], header["facts"], probes)
 
 
 def _placed(tracer: Tracer, scene: SceneMesh, regions: NDArray[np.float64], settings: BakeSettings) -> PlacedLights:
@@ -199,7 +208,25 @@ def _solve_again(solver: LightSolver, cloud: LightCloud, missing: list[tuple[int
     yield from solver.solve(places, take)
 
 
-def _part(steps: Generator[float], first: float, last: float) -> Generator[float]:
-    """Progress as a part of the whole."""
-    for fraction in steps:
-        yield first + (last - first) * fraction
+def _probes(solver: LightSolver, cloud: LightCloud, gathered: Gather, points: int, seed: int,
+            ) -> Generator[float, None, Probes]:
+    """Solutions at places between the cloud's lights."""
+    positions = probe_positions(solver.tracer, cloud, seed)
+    responses = np.zeros((points, len(positions), solver.albedo.shape[1]), np.float32)
+    front = gathered.receivers.key < points
+    step = cloud.emission_order ** 2
+
+    def take(part: slice, response: NDArray[np.float32]) -> None:
+        responses[gathered.receivers.key[front], part] = response[front][:, ::step]
+
+    yield from solver.solve(positions, take)
+    return Probes(positions, responses)
+
+
+def _part(steps: Generator[float, None, Any], first: float, last: float) -> Generator[float, None, Any]:
+    """Progress as a part of the whole; the result."""
+    while True:
+        try:
+            yield first + (last - first) * next(steps)
+        except StopIteration as end:
+            return end.value

@@ -26,6 +26,7 @@ from ..compression.groups import encode_groups
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
+from ..reporting.headline import headline
 from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
 from ..scene.needs import BLACK, GREY_TOLERANCE
@@ -45,6 +46,7 @@ from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
+from .local_budget import local_budget
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
 from .plan import Plan, make_plan, most_clusters
 from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
@@ -103,8 +105,8 @@ def transport_settings(settings: BakeSettings) -> BakeSettings:
     still tells what is buried, dark, or brighter than it can be."""
     if settings.distant_light:
         return settings
-    return replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS), error_receivers=0,
-                   glossy_rows=0, subsurface=False)
+    return replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS), glossy_rows=0,
+                   subsurface=False)
 
 
 @dataclass
@@ -123,6 +125,8 @@ class _Bake:
     cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
     local: LocalTransfer | None = None
     local_scale: float = 1.0
+    local_sample: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
+    local_errors: dict[str, Any] = field(default_factory=dict)
 
     def run(self) -> Generator[Progress, None, BakeResult]:
         """All stages in order."""
@@ -173,8 +177,10 @@ class _Bake:
         highlights: dict[str, Any] = {}
         if self.settings.error_receivers and len(self.open_keys):
             with self.timer.stage("errors"):
-                errors = yield from self._errors(transfer, encodings)
-                highlights = yield from self._highlight_errors(encodings)
+                if self.settings.distant_light:
+                    errors = yield from self._errors(transfer, encodings)
+                    highlights = yield from self._highlight_errors(encodings)
+                self.local_errors = yield from self._local_errors(encodings)
         return self._result(gathered, bounced, transfer, encodings, (errors, highlights), subsurface)
 
     def _progress(self, stage: str, fraction: float) -> Progress:
@@ -383,6 +389,9 @@ class _Bake:
         self.local = local
         if local is None:
             return
+        if local.probes is not None and len(self.open_keys):
+            keys = choose_receivers(self.open_keys, self.settings.error_receivers, self.settings.seed)
+            self.local_sample = keys, local.transfer[keys].astype(np.float64)
         share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
         distant = sum(float(np.sum(np.square(s, dtype=np.float64))) for s in signals.values())
         near = float(np.sum(np.square(local.transfer[self.keys], dtype=np.float64)))
@@ -396,6 +405,7 @@ class _Bake:
             dimmed = share[self.scene.material[target.points], None, None] * np.float32(self.local_scale)
             joined[:, 0, columns:] = local.transfer[target.points] * dimmed
             signals[target.name] = joined
+        self.local = replace(local, transfer=None)
 
     def _signals(self, transfer: NDArray[np.float32], glossy: GlossyRows | None,
                  subsurface: list[BodyLight]) -> dict[str, NDArray[np.float32]]:
@@ -570,6 +580,24 @@ class _Bake:
             surfaces, sample, self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
             int(self.glossy_bounce), settings.error_paths, settings.seed), 0.5, 1.0))
 
+    def _local_errors(self, encodings: dict[str, Encoding]) -> Generator[Progress, None, dict[str, Any]]:
+        """The error budget of lamps' bounced light."""
+        if self.local is None or self.local_sample is None or not len(self.local.probes.positions):
+            return {}
+        settings, (keys, before) = self.settings, self.local_sample
+        share = np.array([part.diffuse_share for part in self.surfaces.parts])[self.scene.material[keys]]
+        compressed = np.zeros_like(before)
+        for target in self.targets:
+            inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
+            if len(inside):
+                place = np.cumsum(~self.scene.loose[target.points]) - 1
+                values = decoded(encodings[target.name], place[keys[inside] - target.points.start])
+                compressed[inside] = values.reshape(len(inside), *self.shapes[target.name])[:, 0, -before.shape[1]:]
+        compressed /= self.local_scale * np.maximum(share, LEAST_DIFFUSE)[:, None, None]
+        return (yield from self._follow("errors", local_budget(
+            self.tracer, self.scene, self.albedo, keys, self.local.cloud, self.local.zone[keys], self.local.probes,
+            before, compressed, settings.bounces, settings.error_paths, settings.seed)))
+
     def _objects_of(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
         """The number of each receiver's target, and the targets' names."""
         numbers = np.zeros(len(keys), np.int64)
@@ -603,6 +631,10 @@ class _Bake:
                            time.perf_counter() - self.started)
         if self.local is not None:
             report["local"] = self.local.facts
+            report["local_errors"] = self.local_errors
+            if not self.settings.distant_light:
+                report["errors"], report["local_errors"] = self.local_errors, {}
+            report["headline"] = headline(report)
             report["scene"]["warnings"] += self.local.facts["warnings"]
         if self.filled:
             note = (f"{plural(self.filled, 'receiver', 'receivers')} inside other objects"

@@ -9,7 +9,7 @@ from .svg_plots import percent
 
 Report = dict[str, Any]
 # What is measured -> the key of its entries in a report.
-PARTS = {"diffuse": "errors", "highlights": "highlight_errors"}
+PARTS = {"diffuse": "errors", "highlights": "highlight_errors", "bounced light of lamps": "local_errors"}
 
 
 def headline(report: Report) -> str:
@@ -20,6 +20,8 @@ def headline(report: Report) -> str:
     """
     totals = {part: total_of(report, part) for part in PARTS}
     told = [f"{percent(value)} ({part})" for part, value in totals.items() if value is not None]
+    if (report.get("settings") or {}).get("lighting") == "local":
+        told = [text.replace("(diffuse)", "(bounced light of lamps)") for text in told]
     if not told:
         return "The error was not measured"
     text = f"Total error {', '.join(told)}"

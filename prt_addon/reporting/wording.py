@@ -13,6 +13,7 @@ STAGES = {
     "interreflection": ("Bounce light", "light is passed from surface to surface until too little is left to matter"),
     "glossy": ("Highlights", "the same rays tell what shiny surfaces reflect towards each direction of view"),
     "subsurface": ("Light through bodies", "light that enters a translucent surface is followed to where it leaves"),
+    "local": ("Light of lamps", "for each light of the cloud: what bounces from surface to surface; alike ones merge"),
     "encode": ("Compress", "points that react to light alike are put into clusters that share their data"),
     "errors": ("Measure the error", "independent light paths at random points check the result; it changes nothing"),
 }

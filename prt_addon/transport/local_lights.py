@@ -28,8 +28,8 @@ Single = NDArray[np.float32]
 # What takes the lights of a slice and their responses (r, lights * functions, channels), in the receivers' order.
 Consumer = Callable[[slice, Single], None]
 
-# Columns carried through the operator at once: 256 of 50,000 receivers and three channels are 154 MB. The more there are,
-# the more of what they do after their first bounce is alike.
+# Columns carried through the operator at once: 256 of 50,000 receivers and three channels are 154 MB. The more there
+# are, the more of what they do after their first bounce is alike.
 COLUMNS = 256
 # Bounces after the first that are compressed anew before the rest goes on as it is.
 COMPRESSED_BOUNCES = 3

@@ -44,6 +44,13 @@ class DistantSuns:
     angles: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class PointLights:
+    """Places (s, 3), metres, of points of 1 W/sr; each brings its own value. Only light that bounced is counted."""
+
+    positions: NDArray[np.float64]
+
+
 @dataclass
 class _Paths:
     """Paths in flight: owner among the receivers, place and normal of their last surface, throughput (n, 3).
@@ -63,12 +70,13 @@ class _Paths:
 
 
 def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, albedo: NDArray[np.float32],
-                       emission: Emission, suns: DistantSuns, paths: int, bounces: int, seed: int,
+                       emission: Emission, suns: DistantSuns | PointLights, paths: int, bounces: int, seed: int,
                        ) -> Generator[float, None, NDArray[np.float64]]:
     """Yield progress, return (2, r, values, 3): unit-albedo exit radiance per emission value, from two halves.
 
     albedo: (points, 3) that surfaces bounce with. emission may return several values per direction; sun light is added
-    to the last one. paths: per receiver, both halves together. bounces: most bounces, -1 for all (Russian roulette).
+    to the last one, of point lights each to its own. paths: per receiver, both halves together. bounces: most bounces,
+    -1 for all (Russian roulette).
     """
     half = max(1, paths // 2)
     at_once = max(1, PATHS_AT_ONCE // half)
@@ -89,7 +97,7 @@ def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet,
 
 
 def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice, albedo: NDArray[np.float32],
-          emission: Emission, suns: DistantSuns, count: int, bounces: int, generator: np.random.Generator,
+          emission: Emission, suns: DistantSuns | PointLights, count: int, bounces: int, generator: np.random.Generator,
           ) -> tuple[NDArray[np.float64], int]:
     """Mean over `count` paths from each receiver of the part, (receivers, values, 3), and the rays traced."""
     number, rays = part.stop - part.start, 0
@@ -100,7 +108,10 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
     first = _stratified(number, count, generator)
     depth = 0
     while len(paths.owner):
-        rays += _add_suns(tracer, receivers, part, paths, suns, total, generator)
+        if isinstance(suns, DistantSuns):
+            rays += _add_suns(tracer, receivers, part, paths, suns, total, generator)
+        elif depth > 0:
+            rays += _add_points(tracer, paths, suns, total)
         directions = _cosine_directions(paths.normals, first if depth == 0 else generator.random((len(paths.owner), 2)))
         paths, directions = _above_surface(receivers, part, paths, directions, depth)
         hits = tracer.nearest(paths.origins, directions)
@@ -157,6 +168,22 @@ def _add_suns(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths
         rays += len(facing)
         np.add.at(total[:, -1], paths.owner[seen],
                   paths.throughput[seen] * (scale * cosine[seen, None] / np.pi) * irradiance)
+    return rays
+
+
+def _add_points(tracer: Tracer, paths: _Paths, lights: PointLights, total: NDArray[np.float64]) -> int:
+    """Add each point light's reflected light at hits to its own value; return the rays traced."""
+    rays = 0
+    for value, position in enumerate(tracer.to_tracing_space(lights.positions)):
+        towards = position - paths.origins
+        square = np.sum(towards.astype(np.float64) ** 2, axis=1)
+        height = np.sum(paths.normals * towards, axis=1) * (np.sum(paths.faces * towards, axis=1) > 0.0)
+        facing = np.flatnonzero(height > 0.0)
+        reach = np.full(len(facing), 1.0 - 1e-5, np.float32)
+        seen = facing[~tracer.occluded(paths.origins[facing], towards[facing], reach)]
+        rays += len(facing)
+        brought = height[seen] / (np.pi * square[seen] ** 1.5 * tracer.diagonal ** 2)
+        np.add.at(total[:, value], paths.owner[seen], paths.throughput[seen] * brought[:, None])
     return rays
 
 

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The error budget of local lights: bounced light of a lamp at places that no light of the cloud has, at random
+receivers, against independent paths.
+
+sampling: our solution at the very place (rays of the gather operator, vertices); cloud: what interpolation between the
+cloud's lights and merging add; compression: clustered PCA; total: what is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lighting.light_cloud import LightCloud
+from ..lighting.light_interpolation import CloudInterpolator
+from ..lighting.light_visibility import surroundings
+from ..scene.scene_mesh import SceneMesh
+from ..tracing.tracer import Tracer
+from ..transport.path_reference import PointLights, reference_radiance
+from ..transport.receiver_set import ReceiverSet
+from .error_budget import summary
+
+# Places of a lamp that the budget looks at, and how near to a surface they may be, in spacings of the cloud: nearer,
+# all light comes from one small bright spot, which no cloud and few rays can follow.
+PLACES, CLEARANCE = 6, 0.5
+
+
+@dataclass(frozen=True)
+class Probes:
+    """positions: (n, 3) of a lamp; responses: (points, n, channels) float32 solved there, of 1 W/sr."""
+
+    positions: NDArray[np.float64]
+    responses: NDArray[np.float32]
+
+
+def probe_positions(tracer: Tracer, cloud: LightCloud, seed: int) -> NDArray[np.float64]:
+    """Random places between the lights of the dense cloud, clear of surfaces, at most PLACES."""
+    generator = np.random.Generator(np.random.PCG64([seed, 79]))
+    dense = cloud.dense[generator.integers(0, len(cloud.dense), 32 * PLACES)]
+    places = dense + cloud.spacing * generator.uniform(-0.5, 0.5, dense.shape)
+    around = surroundings(tracer, places)
+    return places[~around.inside & (around.clearance > CLEARANCE * cloud.spacing)][:PLACES]
+
+
+def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], keys: NDArray[np.int64],
+                 cloud: LightCloud, zone: NDArray[np.int32], probes: Probes, transfer: NDArray[np.float64],
+                 compressed: NDArray[np.float64], bounces: int, paths: int, seed: int,
+                 ) -> Generator[float, None, dict[str, Any]]:
+    """Yield progress, return {"sampling", "cloud", "compression", "total"}: each as in `error_budget`, over receivers,
+    places and channels.
+
+    keys: (k,) of receivers; zone: (k,) theirs; transfer, compressed: (k, columns, channels) before and after.
+    """
+    receivers = ReceiverSet.of_keys(scene, tracer, keys)
+    place = np.searchsorted(keys, receivers.key)
+    before = tracer.rays
+
+    def nothing(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.zeros((len(directions), len(probes.positions), 1))
+
+    truth = yield from reference_radiance(tracer, scene, receivers, albedo, nothing, PointLights(probes.positions),
+                                          paths, bounces, seed)
+    rays = tracer.rays - before
+    shape = truth.shape[1:]  # (k, places, 3)
+    solved = np.broadcast_to(probes.responses[keys[place]].astype(np.float64), shape)
+    weights = CloudInterpolator(cloud, tracer).weights(probes.positions).weights  # (places, zones, lights)
+    own = weights[:, zone[place]].transpose(1, 0, 2)  # (k, places, lights)
+    step = cloud.emission_order ** 2
+    interpolated, drawn = (np.broadcast_to(np.einsum("kpl,klc->kpc", own, values[place][:, ::step][:, :own.shape[2]]),
+                                           shape) for values in (transfer, compressed))  # small
+    first, second = truth
+    # Every place counts alike, whether it is near to a surface, where all is brighter, or far.
+    power = first * second
+    alike = 1.0 / np.maximum(power.sum(axis=(0, 2), keepdims=True), np.finfo(np.float64).tiny)
+    power = np.sum(power * alike, axis=(1, 2))
+
+    def entry(squared: NDArray[np.float64], reference_rays: int) -> dict[str, Any]:
+        return summary(np.sum(squared * alike, axis=(1, 2)), power, reference_rays, seed)
+
+    return {"sampling": entry((solved - first) * (solved - second), rays),
+            "cloud": entry((interpolated - solved) ** 2, 0),
+            "compression": entry((drawn - interpolated) ** 2, 0),
+            "total": entry((drawn - first) * (drawn - second), rays)}
