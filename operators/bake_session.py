@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..prt_addon.baking import job as jobs
 from ..prt_addon.baking.local_lights import fit_to_lamps
@@ -51,7 +52,10 @@ def jobs_folder() -> Path:
 def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> SceneMesh:
     """The scene as it is traced, with what was left out among its warnings. targets: as `read_objects` takes them."""
     warnings: list[str] = []
-    mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings), settings.spacing)
+    lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
+    centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
+    mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings), settings.spacing,
+                              np.concatenate([lamps, centres]) if settings.local_light else None)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 

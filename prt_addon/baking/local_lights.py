@@ -183,8 +183,8 @@ def _merge(tracer: Tracer, lights: PlacedLights, responses: NDArray[np.float32],
     labels = merge_lights(positions, responses, mutual_visibility(tracer, positions), w1, w2)
     places = merged_positions(tracer, positions, labels)
     sizes = np.bincount(labels)
-    if settings.merged_response == "harmonic":
-        merged = merged_response(responses, labels, "harmonic", channels)
+    if settings.merged_response != "solution":
+        merged = merged_response(responses, labels, settings.merged_response, channels)
         return places, [merged[:, cluster] for cluster in range(len(places))]
     first = np.array([np.flatnonzero(labels == cluster)[0] for cluster in range(len(places))])
     return places, [np.array(responses[:, first[c]]) if sizes[c] == 1 else None for c in range(len(places))]

@@ -33,13 +33,15 @@ def signed_volume(positions: NDArray[np.float64], triangles: NDArray[np.int32]) 
     return float(np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2]))) / 6.0
 
 
-def outward(mesh: ObjectMesh, others: list[ObjectMesh], warnings: list[str]) -> ObjectMesh:
-    """The mesh wound outwards, if it is closed, winds inwards, and is no room (nothing else lies inside its box)."""
+def outward(mesh: ObjectMesh, others: list[ObjectMesh], warnings: list[str],
+            lamps: NDArray[np.float64] | None = None) -> ObjectMesh:
+    """The mesh wound outwards, if it is closed, winds inwards, and is no room (neither another mesh nor a lamp, of
+    positions (n, 3), lies inside its box)."""
     if not is_closed(mesh.positions, mesh.triangles) or signed_volume(mesh.positions, mesh.triangles) >= 0.0:
         return mesh
     low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
-    for other in others:
-        if len(other.positions) and np.any(np.all((other.positions > low) & (other.positions < high), axis=1)):
+    for positions in [other.positions for other in others] + ([] if lamps is None else [lamps]):
+        if len(positions) and np.any(np.all((positions > low) & (positions < high), axis=1)):
             return mesh
     warnings.append(f"{mesh.name}: all faces point inwards; baked as if they pointed outwards (recalculate normals)")
     tangents = None if mesh.corner_tangents is None else mesh.corner_tangents[:, ::-1]

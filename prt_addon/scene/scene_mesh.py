@@ -74,18 +74,19 @@ class SceneMesh:
         return bounding_diagonal([self.points[o.points] for o in self.objects if o.is_target])
 
     @staticmethod
-    def assemble(objects: list[ObjectMesh], spacing: float = 0.0) -> SceneMesh:
+    def assemble(objects: list[ObjectMesh], spacing: float = 0.0,
+                 lamps: NDArray[np.float64] | None = None) -> SceneMesh:
         """Join objects into one scene.
 
         spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal, and beyond
-        that diagonal of the distance from them; 0 keeps the meshes as they are. Raises BadScene, naming the
-        object, where nothing can be baked.
+        that diagonal of the distance from them; 0 keeps the meshes as they are. lamps: (n, 3) places inside rooms, which
+        stay wound inwards. Raises BadScene, naming the object, where nothing can be baked.
         """
         if not any(o.is_target for o in objects):
             raise BadScene("scene", "no mesh object to bake", "Select a mesh object, or make one visible in renders")
         warnings: list[str] = []
         cleaned = [clean(o, warnings) for o in objects]
-        cleaned = [outward(o, [c for c in cleaned if c is not o], warnings) for o in cleaned]
+        cleaned = [outward(o, [c for c in cleaned if c is not o], warnings, lamps) for o in cleaned]
         targets = np.concatenate([o.positions for o in cleaned if o.is_target])
         diagonal = bounding_diagonal([targets])
         if diagonal <= 0.0:
