@@ -21,7 +21,7 @@ from ..basis.directions import cosine_hemisphere, tangent_frames
 from ..basis.point_sets import fibonacci_disc, fibonacci_square
 from ..lighting.local_lights import LEAST_SPREAD, LocalLight, spot_pattern, spread_pattern
 from ..linear_algebra import multiply
-from ..scene.receivers import LIFT
+from ..scene.receivers import LIFT, ray_origins
 from ..tracing.tracer import Tracer
 from ..transport.receiver_set import ReceiverSet
 from .source_irradiance import cap_irradiance, polygon_irradiance
@@ -66,6 +66,15 @@ class LitReceivers:
         normals = np.asarray(normals, np.float64)
         lifted = np.asarray(positions, np.float64) + (LIFT * tracer.diagonal) * normals
         origins = tracer.to_tracing_space(lifted)
+        return LitReceivers(origins, _by_axis(origins), _by_axis(normals))
+
+    @staticmethod
+    def of_mesh(tracer: Tracer, positions: ArrayLike, normals: ArrayLike, triangles: NDArray[np.int32]) -> LitReceivers:
+        """The same for the vertices of triangles (t, 3): pulled into their faces as in the bake, or the corners of a
+        room would be dark."""
+        normals = np.asarray(normals, np.float64)
+        starts = ray_origins(np.asarray(positions, np.float64), normals, triangles, tracer.diagonal)
+        origins = tracer.to_tracing_space(starts)
         return LitReceivers(origins, _by_axis(origins), _by_axis(normals))
 
     def __len__(self) -> int:

@@ -98,7 +98,7 @@ class DirectLight:
 
     def __init__(self, tracer: Tracer, baked: Baked, samples: int = SHADOW_SAMPLES) -> None:
         self._tracer, self._samples = tracer, samples
-        self._receivers = LitReceivers.of_points(tracer, baked.positions, baked.normals)
+        self._receivers = LitReceivers.of_mesh(tracer, baked.positions, baked.normals, baked.triangles)
         self._rows = baked.bases.shape[2]
 
     def of(self, lamps: Sequence[LocalLight]) -> NDArray[np.float32]:

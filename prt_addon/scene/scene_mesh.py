@@ -79,8 +79,8 @@ class SceneMesh:
         """Join objects into one scene.
 
         spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal, and beyond
-        that diagonal of the distance from them; 0 keeps the meshes as they are. lamps: (n, 3) places inside rooms, which
-        stay wound inwards. Raises BadScene, naming the object, where nothing can be baked.
+        that diagonal of the distance from them; 0 keeps the meshes as they are. lamps: (n, 3) places inside rooms,
+        which stay wound inwards. Raises BadScene, naming the object, where nothing can be baked.
         """
         if not any(o.is_target for o in objects):
             raise BadScene("scene", "no mesh object to bake", "Select a mesh object, or make one visible in renders")

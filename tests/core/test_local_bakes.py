@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes of local lights end to end, without Blender: against paths, in zones, resumed, and in stiff and extreme cases."""
+"""Bakes of local lights end to end, without Blender: against paths, in zones, resumed, in stiff and extreme cases."""
 
 from __future__ import annotations
 
