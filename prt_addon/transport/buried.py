@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ..basis.directions import quadrature
 from ..scene.scene_mesh import SceneMesh
@@ -72,6 +73,33 @@ def _longest_edges(scene: SceneMesh) -> NDArray[np.float64]:
     for corner in range(3):
         np.maximum.at(longest, scene.triangles[:, corner], np.maximum(lengths[:, corner], lengths[:, corner - 1]))
     return longest
+
+
+def past_buried(matrix: sparse.csr_matrix, key: NDArray[np.int64], scene: SceneMesh,
+                buried: NDArray[np.int64]) -> sparse.csr_matrix:
+    """A gather operator (r, r) that sees, in place of a buried receiver at the rim, the mean of its open neighbours.
+
+    What is seen next to a contact lies on a triangle that reaches below the body, and interpolation would mix its dark
+    corner in: of the bounced light of a lamp in a Cornell box, 95 % of the squared error sat in the 2 % of receivers
+    along the blocks' feet. key: (r,) of the receivers; buried: keys.
+    """
+    count = len(scene.points)
+    row = np.full(2 * count, -1, np.int64)
+    row[key] = np.arange(len(key))
+    hidden = np.zeros(count, bool)
+    hidden[buried[buried < count]] = True
+    triangles = scene.triangles[hidden[scene.triangles].any(axis=1)]
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    rim = edges[hidden[edges[:, 0]] & ~hidden[edges[:, 1]] & (row[edges] >= 0).all(axis=1)]
+    if not len(rim):
+        return matrix
+    target, source = row[rim[:, 0]], row[rim[:, 1]]
+    own = np.bincount(target, minlength=len(key))
+    kept = np.flatnonzero(own == 0)
+    place = (np.concatenate([kept, target]), np.concatenate([kept, source]))
+    share = np.concatenate([np.ones(len(kept)), 1.0 / own[target]]).astype(np.float32)
+    return (matrix * sparse.csr_matrix((share, place), shape=matrix.shape)).tocsr()
 
 
 def fill_buried(triangles: NDArray[np.int32], loose: NDArray[np.bool_], buried: NDArray[np.int64],
