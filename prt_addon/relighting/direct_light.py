@@ -151,7 +151,7 @@ class _Source:
         # E / pi = I cos / (pi d^2), for every kind of lamp from afar
         colour = light.peak_intensity / (math.pi * tracer.diagonal ** 2)
         brightest = float(np.max(np.abs(colour), initial=0.0))
-        scale = float(np.sqrt(np.sum(light.to_local ** 2))) or 1.0
+        scale = float(np.sqrt(np.sum(light.to_local ** 2)))
         return _Source(light, centre, light.axis.astype(np.float32),
                        (light.half_axes / tracer.diagonal).astype(np.float32),
                        (light.to_local / scale).astype(np.float32), extent if light.kind != "area" else 0.0, extent,
