@@ -32,6 +32,11 @@ Single = NDArray[np.float32]
 BLOCK = 4096
 # A lamp nearer than this is held at it: single precision knows no smaller distance inside the scene's unit box.
 NEAREST = 6e-8
+# A lamp farther away, in diagonals of the scene, gives nothing: 1e9 W would give a scene of a millimetre 1e-17 W/m^2;
+# squares of still larger distances leave single precision.
+FARTHEST = 1e15
+# The share of a ball's radius by which rounding may put a receiver on its surface inside or outside of it.
+SURFACE = 1e-5
 # Points without rays by which a spot's edge across a wide lamp, and a grid's shade on an Area, are integrated.
 FINE = 192
 # Within this many half widths of an Area its irradiance comes from Lambert's formula; beyond, its points are within
@@ -102,10 +107,19 @@ def direct_local_light(tracer: Tracer, receivers: LitReceivers | ReceiverSet, li
 def sample_count(extent: float, distance: float, samples: int) -> int:
     """Points for a lamp of this half width seen from a typical distance: 1 for none, all of them from a tenth of the
     distance on, at least 4 where it throws any soft shadow. The sides of a penumbra show 1 / count steps of the light,
-    and a lamp half as wide throws one half as wide."""
+    and a lamp half as wide throws one half as wide. In halves, because every other count is another set of points, at
+    which a shadow leaps while the lamp moves."""
     if extent <= 0.0 or samples <= 1:
         return 1
-    return int(min(samples, max(4, math.ceil(samples * min(1.0, 10.0 * extent / max(distance, 1e-30))))))
+    wanted = samples * min(1.0, 10.0 * extent / max(distance, 1e-30))
+    while samples >= 8 and 0.5 * samples >= wanted:
+        samples //= 2
+    return samples
+
+
+def has_grid(light: LocalLight) -> bool:
+    """Whether an Area light's spread is less than all directions."""
+    return light.kind == "area" and light.spread < math.pi - 2e-6
 
 
 def _by_axis(vectors: NDArray[np.floating]) -> Single:
@@ -140,16 +154,22 @@ class _Source:
     def of(light: LocalLight, tracer: Tracer, receivers: LitReceivers, samples: int, seed: int,
            cutoff: float) -> _Source:
         """Bring a lamp to tracing space. Irradiance of a unit there is 1 / diagonal^2 of one in the world."""
-        centre = tracer.to_tracing_space(light.position[None])[0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            centre = tracer.to_tracing_space(light.position[None])[0]
+        lost = not np.all(np.abs(centre) < FARTHEST)
+        if lost:
+            centre = np.zeros(3, np.float32)
         extent = light.extent / tracer.diagonal
         if extent < NEAREST:
             extent = 0.0  # thinner than single precision tells apart: a point
         some = receivers.places[:, ::max(1, len(receivers) // 512)]
         typical = float(np.median(_length(some - centre[:, None]))) if some.size else 0.0
         count = sample_count(extent, typical, samples)
-        spread = fibonacci_square if light.kind == "area" and light.shape == "rectangle" else fibonacci_disc
+        # what a grid lets be seen of an ellipse is cut out of a rectangle (`_Face`)
+        square = light.kind == "area" and (light.shape == "rectangle" or has_grid(light))
+        spread = fibonacci_square if square else fibonacci_disc
         # E / pi = I cos / (pi d^2), for every kind of lamp from afar
-        colour = light.peak_intensity / (math.pi * tracer.diagonal ** 2)
+        colour = light.peak_intensity * (0.0 if lost else 1.0 / (math.pi * tracer.diagonal ** 2))
         brightest = float(np.max(np.abs(colour), initial=0.0))
         scale = float(np.sqrt(np.sum(light.to_local ** 2)))
         return _Source(light, centre, light.axis.astype(np.float32),
@@ -235,7 +255,7 @@ def _aim(source: _Source, places: Single, normals: Single) -> _Aimed:
 
 def _aim_at_point(source: _Source, towards: Single, distance: Single, height: Single) -> _Aimed:
     """A lamp without extent: intensity cos / d^2."""
-    value = np.maximum(height, 0.0) / (distance * distance * distance)
+    value = np.maximum(height, 0.0) / distance / (distance * distance)
     if source.light.kind == "spot":
         value *= _spot_share(source, towards)
     chosen = np.flatnonzero(value > source.least)
@@ -254,7 +274,7 @@ def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: S
     square = distance.astype(np.float64) ** 2
     sine_squared = radius ** 2 / (square + radius ** 2) if soft else np.minimum(radius ** 2 / square, 1.0)
     value = cap_irradiance(sine_squared, np.clip(height / distance, -1.0, 1.0).astype(np.float64))
-    inside = np.zeros(len(distance), bool) if soft else distance < radius
+    inside = np.zeros(len(distance), bool) if soft else distance < radius * (1.0 + SURFACE)
     value[inside] = math.pi  # the sphere shines on both sides: all around the receiver
     value /= math.pi * radius ** 2
     chosen = np.flatnonzero(value > source.least)
@@ -267,7 +287,8 @@ def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: S
     to_disc = far - within
     directions = _disc_points(frames, to_disc, rim, source.points)
     facing = np.ascontiguousarray(np.take(normals, chosen, axis=1).T)
-    weights = _heights(directions, facing) * to_disc / _fourth_power(directions)
+    square = _squares(directions)
+    weights = _heights(directions, facing) / square * (to_disc / square)
     where = np.flatnonzero(inside[chosen])
     if len(where):
         _aim_from_inside(source, where, middle[where], facing[where], directions, weights)
@@ -316,7 +337,8 @@ def _spot_edge(source: _Source, frames: Single, distance: Single, radius: Single
     got, whole = np.zeros(len(distance), np.float32), np.zeros(len(distance), np.float32)
     for start in range(0, FINE, 16):
         directions = _disc_points(frames, distance, radius, source.fine[start:start + 16])
-        weights = _heights(directions, normals) / _fourth_power(directions)
+        square = _squares(directions)
+        weights = _heights(directions, normals) / square * (distance / square)
         got += np.sum(weights * _spot_share(source, directions.reshape(-1, 3).T).reshape(weights.shape), axis=0)
         whole += np.sum(weights, axis=0)
     return np.divide(got, whole, out=np.zeros_like(got), where=whole > 0.0)
@@ -369,7 +391,7 @@ class _Face:
         count = len(depth)
         middle, half = np.zeros((count, 2), np.float32), np.ones((count, 2), np.float32)
         opening = 0.5 * max(source.light.spread, LEAST_SPREAD)
-        narrow = opening < 0.5 * math.pi - 1e-6
+        narrow = has_grid(source.light)
         size = np.sqrt(np.sum(source.half_axes.astype(np.float64) ** 2, axis=1))
         if narrow and abs(float(np.sum(source.half_axes[0] * source.half_axes[1]))) < 1e-3 * size[0] * size[1]:
             reach = depth * math.tan(opening)
@@ -390,10 +412,10 @@ class _Face:
         place = self.middle + points[:, None, :] * self.half
         first, second = self.source.half_axes
         directions = place[..., :1] * first + place[..., 1:] * second - self.away
-        weights = _heights(directions, self.normals) * self.depth / _fourth_power(directions)
+        square = _squares(directions)
+        weights = _heights(directions, self.normals) / square * (self.depth / square)
         if self.narrow:
-            length = np.sqrt(np.sum(directions ** 2, axis=2))
-            weights *= spread_pattern(self.depth / length, self.source.light.spread)
+            weights *= spread_pattern(self.depth / np.sqrt(square), self.source.light.spread)
             if self.source.light.shape == "ellipse":
                 weights *= np.sum(place ** 2, axis=2) <= 1.0
         return directions, weights
@@ -437,7 +459,7 @@ def _heights(directions: Single, normals: Single) -> Single:
     return np.maximum(sum(directions[..., k] * normals[:, k] for k in range(3)), 0.0)
 
 
-def _fourth_power(directions: Single) -> Single:
-    """Lengths to the fourth power (n, c); held at NEAREST."""
+def _squares(directions: Single) -> Single:
+    """Squared lengths (n, c) of directions (n, c, 3); held at those of NEAREST."""
     square = directions[..., 0] ** 2 + directions[..., 1] ** 2 + directions[..., 2] ** 2
-    return np.maximum(square, np.float32(NEAREST ** 2)) ** 2
+    return np.maximum(square, np.float32(NEAREST ** 2))

@@ -253,8 +253,8 @@ FLAT = [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 1.0), (1e-
 def test_flattened_lamps_are_finite(kind, scale):
     for options in ({}, {"spot_angle": 0.02, "spot_blend": 0.0, "spread": 0.02, "radius": 1e-9, "size": (0.0, 1.0)}):
         light = lamp(kind, scale, **options)
-        results = [light.emission(1), light.emission(4), light.intensity(SPHERE[:100]), light.intensity(np.zeros((1, 3))),
-                   light.axis, light.area, light.extent, light.explained(3), *light.points(8)]
+        results = [light.emission(1), light.emission(4), light.intensity(SPHERE[:100]), light.axis, light.area,
+                   light.intensity(np.zeros((1, 3))), light.extent, light.explained(3), *light.points(8)]
         assert all(np.all(np.isfinite(result)) for result in results)
 
 
