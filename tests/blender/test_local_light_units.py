@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+import warnings
 
 import bpy
 import numpy as np
@@ -63,9 +63,9 @@ def add_plate(low, high, height):
     return points, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
-def read(warnings=None):
+def read(lines=None):
     bpy.context.view_layer.update()
-    return read_local_lights(bpy.context.evaluated_depsgraph_get(), [] if warnings is None else warnings)
+    return read_local_lights(bpy.context.evaluated_depsgraph_get(), [] if lines is None else lines)
 
 
 def both(positions, normals=UP, samples=1, occluder=None, ours_samples=64):
@@ -137,6 +137,15 @@ def test_a_point_with_a_radius_equals_cycles(soft_falloff, radius) -> None:
     positions, normals = np.repeat(places, len(TILTED), axis=0), np.tile(TILTED, (len(places), 1))
     ours, theirs = both(positions, normals, 1024)
     np.testing.assert_allclose(ours, theirs, rtol=1e-2, atol=3e-3 * theirs.max())
+
+
+@pytest.mark.usefixtures("scene")
+def test_within_the_ball_of_a_spot_equals_cycles_where_cycles_agrees_with_itself() -> None:
+    """Before the lamp's middle. Elsewhere within the ball Cycles' two ways to find light disagree about the cone: one
+    knows it, the other does not, and the bake shows their mean; here there is no cone."""
+    add_lamp("SPOT", shadow_soft_size=0.8, use_soft_falloff=False, spot_size=0.6, spot_blend=0.3)
+    ours, theirs = both([[0, 0, 1.5], [0, 0, 0.8], [0.7, 0, 0.8]], samples=1024)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-2, atol=1e-2 * theirs.max())
 
 
 @pytest.mark.usefixtures("scene")
@@ -213,9 +222,32 @@ def test_constant_nodes_equal_cycles() -> None:
 def test_nodes_that_are_switched_off_do_nothing() -> None:
     lamp = add_lamp("POINT")
     with_nodes(lamp)
-    lamp.data.use_nodes = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # the switch goes with Blender 6
+        lamp.data.use_nodes = False
     ours, theirs = both([[0.0, 0, 0]])
     np.testing.assert_allclose(ours, theirs, rtol=2e-3)
+
+
+@pytest.mark.usefixtures("scene")
+def test_what_only_other_engines_read_does_nothing() -> None:
+    add_lamp("SPOT", diffuse_factor=0.2, use_custom_distance=True, cutoff_distance=0.5, use_square=True, spot_size=1.5)
+    ours, theirs = both(line(9))
+    np.testing.assert_allclose(ours, theirs, rtol=2e-3)
+
+
+@pytest.mark.usefixtures("scene")
+def test_other_nodes_are_said_and_none_give_no_light() -> None:
+    tree, emission = with_nodes(add_lamp("POINT"))
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    tree.links.new(noise.outputs[0], emission.inputs["Strength"])
+    lines: list[str] = []
+    np.testing.assert_allclose(read(lines)[0].power, 40.0 * np.array([1, 0.5, 0.25]))
+    assert "more than a constant Emission" in lines[0]
+    tree.links.clear()
+    assert read() == []
+    use_cycles(1)
+    assert not baked_irradiance(add_facets(np.zeros((1, 3)), UP)).any()
 
 
 @pytest.mark.usefixtures("scene")
@@ -251,11 +283,11 @@ def test_what_a_render_does_not_show_gives_no_light() -> None:
     unseen.scale = (0.0, 1.0, 1.0)
     sun.name = "Sun"
     portal.name, dark.name = "Portal", "Dark"
-    warnings: list[str] = []
-    assert read(warnings) == []
-    assert len(warnings) == 3  # of the ray visibility, the portal and the area without area
+    lines: list[str] = []
+    assert read(lines) == []
+    assert len(lines) == 3  # of the ray visibility, the portal and the area without area
     for name in ("Dark: its ray visibility", "Portal: a portal", "Lamp.004: an Area light without any area"):
-        assert any(line.startswith(name) for line in warnings), warnings
+        assert any(line.startswith(name) for line in lines), lines
 
 
 @pytest.mark.usefixtures("scene")
@@ -263,11 +295,11 @@ def test_a_lamp_that_only_the_viewport_hides_shines() -> None:
     lamp = add_lamp("POINT")
     bpy.context.view_layer.update()
     lamp.hide_viewport = True
-    warnings: list[str] = []
-    found = read(warnings)
+    lines: list[str] = []
+    found = read(lines)
     assert [light.name for light in found] == ["Lamp"]
     np.testing.assert_allclose(found[0].position, [0, 0, 2])
-    assert "the viewport hides it" in warnings[0]
+    assert "the viewport hides it" in lines[0]
 
 
 @pytest.mark.usefixtures("scene")
@@ -281,12 +313,12 @@ def test_what_is_not_done_is_said() -> None:
     profile = tree.nodes.new("ShaderNodeTexIES")
     tree.links.new(profile.outputs[0], falloff.inputs["Strength"])
     tree.links.new(falloff.outputs["Linear"], emission.inputs["Strength"])
-    warnings: list[str] = []
-    (light,) = read(warnings)
+    lines: list[str] = []
+    (light,) = read(lines)
     assert not light.shadow
     for words in ("no shadow", "2 bounces", "light linking", "shadow linking", "IES profile", "Light Falloff"):
-        assert sum(words in line for line in warnings) == 1, (words, warnings)
-    assert all(line.startswith("Lamp") for line in warnings)
+        assert sum(words in line for line in lines) == 1, (words, lines)
+    assert all(line.startswith("Lamp") for line in lines)
 
 
 @pytest.mark.usefixtures("scene")
@@ -310,14 +342,11 @@ def test_extremes_and_broken_numbers() -> None:
 @pytest.mark.usefixtures("scene")
 def test_a_parent_that_shears_an_area_is_said() -> None:
     lamp = add_lamp("AREA")
-    sheared = Matrix.Identity(4)
-    sheared[0][1] = 0.7
     parent = bpy.data.objects.new("Parent", None)
     bpy.context.scene.collection.objects.link(parent)
     parent.scale = (3.0, 1.0, 1.0)
     lamp.parent, lamp.matrix_world = parent, Matrix.Identity(4)
     lamp.matrix_local = Matrix.Rotation(0.6, 4, "Z")
-    warnings: list[str] = []
-    assert len(read(warnings)) == 1
-    assert "shears" in warnings[0]
-    assert all(a <= b for a, b in pairwise(sorted(warnings)))
+    lines: list[str] = []
+    assert len(read(lines)) == 1
+    assert "shears" in lines[0]

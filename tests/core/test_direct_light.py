@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import math
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from prt_addon.basis.directions import random_rotation
-from prt_addon.lighting.local_lights import LocalLight, spot_pattern
+from prt_addon.lighting.local_lights import LocalLight, spot_pattern, spread_factor, spread_pattern
 from prt_addon.relighting.direct_light import LitReceivers, direct_local_light, sample_count
+from prt_addon.relighting.lamp_light import DirectLight
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.tracing.tracer import Tracer
 from prt_addon.transport.receiver_set import ReceiverSet
@@ -84,8 +86,6 @@ def face_points(light, count):
 
 def brute_area(light, position, normal, count=40_000):
     """E / pi of an Area by a sum over its face; peak radiance P / (pi area) times the grid's share."""
-    from prt_addon.lighting.local_lights import spread_factor, spread_pattern
-
     towards = face_points(light, count) - position
     square = np.sum(towards ** 2, axis=1)
     emitted = -(towards @ light.axis) / np.sqrt(square)
@@ -107,6 +107,21 @@ def test_an_area_equals_a_sum_over_its_face_near_and_far(shape, spread):
     found = lit(light, positions=positions, normals=normals, samples=64, tracer=tracer_of(
         plane(size=0.01, centre=(50, 50))))
     np.testing.assert_allclose(found, expected, rtol=5e-3 if spread == math.pi else 0.03, atol=5e-3 * expected.max())
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "ellipse"])
+def test_where_formula_and_points_meet_no_ring_shows(shape):
+    """From 1 to 12 half widths: the closed form near by and four points from 5 on are both within 1e-3."""
+    light = lamp("area", (0.0, 0, 0), shape=shape, size=(1.0, 0.6))
+    far = np.linspace(1.0, 12.0, 56)[:, None] * light.extent
+    positions = far * np.array([[0.5, 0.2, -math.sqrt(0.71)]])
+    normals = np.array([[-0.6, 0.0, 0.8]])
+    expected = np.array([brute_area(light, p, normals[0]) for p in positions])
+    found = lit(light, positions=positions, normals=normals, tracer=tracer_of(plane(size=0.01, centre=(9, 9))))
+    bound = np.where(far[:, 0] < 1.5 * light.extent, 5e-3, 1e-3)
+    assert np.all(np.abs(found / expected - 1) < bound)
+    ratio = found / expected
+    assert np.abs(np.diff(ratio))[far[1:, 0] > 3 * light.extent].max() < 1e-3
 
 
 def test_an_area_lights_one_side_however_it_is_mirrored():
@@ -140,8 +155,7 @@ def test_inside_a_ball_all_the_sky_shines():
     """E = pi L with L = I / (pi r^2); the half of the sky behind a wall is dark, and the ball's own rim is no edge."""
     ball = lamp("point", (0.0, 0, 0.2), radius=1.0, soft_falloff=False)
     assert lit(ball, positions=[[0.0, 0, 0]]) == pytest.approx(1 / math.pi, rel=1e-5)
-    wall = plane(size=60.0)
-    wall = join("wall", wall, plane(size=8.0, height=-1.0))
+    wall = join("wall", plane(size=60.0), plane(size=8.0, height=-1.0))
     upright = np.array([0.0, 1.0, 0.0])
     half = lit(ball, tracer_of(wall), [[0.0, 0, 0.1]], upright, samples=256)
     # up to the ball's surface; the floor at height 0 cuts off what lies below it
@@ -307,6 +321,19 @@ def test_threads_blocks_and_the_order_of_receivers_change_nothing():
     shuffled = np.random.Generator(np.random.PCG64(1)).permutation(len(positions))
     again = direct_local_light(one, LitReceivers.of_points(one, positions[shuffled], normals[shuffled]), lights)
     np.testing.assert_allclose(again, expected[shuffled], rtol=1e-6, atol=1e-7)
+
+
+def test_the_preview_gets_its_receivers_order_and_rows():
+    scene = sphere(subdivisions=3)
+    tracer = tracer_of(scene, FLOOR)
+    baked = SimpleNamespace(positions=scene.positions, normals=scene.positions, bases=np.zeros((1, 2, 4, 9, 1)))
+    lights = [lamp("point", (1.0, 2.0, 3.0)), lamp("point", (-2.0, 0, 1), radius=0.2)]
+    found = DirectLight(tracer, baked, samples=8).of(lights)
+    plain = direct_local_light(tracer, LitReceivers.of_points(tracer, scene.positions, scene.positions), lights, 8)
+    assert found.shape == (len(scene.positions), 4, 3)
+    np.testing.assert_allclose(found[:, 0], plain, rtol=1e-6)
+    assert not found[:, 1:].any()
+    assert plain.any()
 
 
 def test_a_cutoff_costs_no_more_than_itself():
