@@ -287,7 +287,7 @@ def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: S
     chosen = np.flatnonzero(value > source.least)
     if source.light.kind == "spot":
         dark, sharp, soft_edge = _cone_edges(source, np.take(towards, chosen, axis=1), sine_squared[chosen])
-        ball = inside[chosen]  # inside it there is no cone (Cycles: half of one, tests/blender/test_local_light_units.py)
+        ball = inside[chosen]  # where it has no cone (Cycles: half of one, see the tests)
         kept = ~dark | ball
         chosen, edges = chosen[kept], [(edge & ~ball)[kept] for edge in (sharp, soft_edge)]
     if not len(chosen):
