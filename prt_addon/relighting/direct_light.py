@@ -40,6 +40,8 @@ SURFACE = 1e-5
 # Points without rays by which a spot's edge across a wide lamp, and a grid's shade on an Area, are integrated: FINE
 # where the light leaps between them, SMOOTH where it does not.
 FINE, SMOOTH = 192, 32
+# Such points taken at once: fewer calls of numpy, and the arrays stay in the cache.
+AT_ONCE = 8
 # Within this many half widths of an Area its irradiance comes from Lambert's formula; beyond, four points that are
 # exact for polynomials of degree 3 are within 1e-3 of that.
 NEAR = 5.0
@@ -307,6 +309,8 @@ def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: S
     value = value[chosen].astype(np.float32)
     for edge, rule in zip(edges, (source.fine, source.smooth), strict=True) if source.light.kind == "spot" else ():
         some = np.flatnonzero(edge)
+        if not len(some):
+            continue
         value[some] *= _spot_edge(source, rule, frames[some], to_disc[some], rim[some], facing[some])
         parted = directions[:, some]
         weights[:, some] *= _spot_share(source, parted.reshape(-1, 3).T).reshape(parted.shape[:2])
@@ -377,15 +381,20 @@ def _spot_edge(source: _Source, points: Single, frames: Single, distance: Single
     to_local = source.to_local.T
     local = [multiply(vector, to_local).T for vector in (middle, first, second)]
     heights = [np.sum(vector * normals, axis=1) for vector in (middle, first, second)]
+    scale = np.float32(1.0 / math.sqrt(3.0)) if source.stretch < 1.0 + 1e-5 else None  # of an even `to_local`
     got, whole = np.zeros(len(distance), np.float32), np.zeros(len(distance), np.float32)
-    for u, v in points:
+    for start in range(0, len(points), AT_ONCE):
+        u, v = points[start:start + AT_ONCE].T[:, :, None]
         height = np.maximum(heights[0] + u * heights[1] + v * heights[2], 0.0)
-        square = np.maximum(distance * distance + (u * u + v * v) * radius * radius, np.float32(NEAREST ** 2))
+        square = np.maximum(distance * distance + (u * u + v * v) * (radius * radius), np.float32(NEAREST ** 2))
         weight = height / square * (distance / square)
-        x, y, z = local[0] + u * local[1] + v * local[2]
-        length = np.sqrt(np.maximum(x * x + y * y + z * z, np.finfo(np.float32).tiny))
-        got += weight * spot_pattern(z / length, source.light.spot_angle, source.light.spot_blend)
-        whole += weight
+        x, y, z = (local[0][k] + u * local[1][k] + v * local[2][k] if k == 2 or scale is None else 0.0
+                   for k in range(3))
+        length = np.sqrt(square) * scale if scale is not None else np.sqrt(
+            np.maximum(x * x + y * y + z * z, np.finfo(np.float32).tiny))
+        share = spot_pattern(z / length, source.light.spot_angle, source.light.spot_blend)
+        got += np.sum(weight * share, axis=0)
+        whole += np.sum(weight, axis=0)
     return np.divide(got, whole, out=np.zeros_like(got), where=whole > 0.0)
 
 
@@ -475,16 +484,19 @@ class _Face:
         flat = 1.0 / (self.depth * np.float32(math.tan(0.5 * max(self.source.light.spread, LEAST_SPREAD))))
         u_x, v_x, v_y = self.half[:, 0] * first, self.half[:, 1] * slant, self.half[:, 1] * second
         total = np.zeros(len(self.depth), np.float32)
-        for u, v in points:
+        for start in range(0, len(points), AT_ONCE):
+            u, v = points[start:start + AT_ONCE].T[:, :, None]
             x, y = middle_x + u * u_x + v * v_x, middle_y + v * v_y
             aside = x * x + y * y
             square = np.maximum(aside + self.depth * self.depth, np.float32(NEAREST ** 2))
             height = np.maximum(normal_x * x + normal_y * y + level, 0.0)
-            weight = height / square * (self.depth / square) * np.maximum(1.0 - np.sqrt(aside) * flat, 0.0)
-            if self.source.light.shape == "ellipse":
-                weight *= (self.middle[:, 0] + u * self.half[:, 0]) ** 2 + (
-                    self.middle[:, 1] + v * self.half[:, 1]) ** 2 <= 1.0
-            total += weight
+            weight = height / square * (self.depth / square)
+            if self.narrow:
+                weight *= np.maximum(1.0 - np.sqrt(aside) * flat, 0.0)
+                if self.source.light.shape == "ellipse":
+                    weight *= (self.middle[:, 0] + u * self.half[:, 0]) ** 2 + (
+                        self.middle[:, 1] + v * self.half[:, 1]) ** 2 <= 1.0
+            total += np.sum(weight, axis=0)
         return total / len(points)
 
     def exact(self, near: NDArray[np.int64]) -> Single:
