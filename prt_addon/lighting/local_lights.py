@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
 
 from ..basis.point_sets import fibonacci_disc, fibonacci_square
 from ..basis.spherical_harmonics import evaluate, expand_bands
@@ -33,6 +34,8 @@ NODES, AZIMUTHS = 48, 96
 NEGATIVE = 0.05
 # Spreads below this are treated as this (Blender's own least value is 1 degree): towards 0 the radiance has no limit.
 LEAST_SPREAD = math.radians(0.5)
+# Least stretch of a lamp's scale over its largest: flatter cones can't be told apart in single precision.
+FLATTEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +62,16 @@ class LocalLight:
     size: tuple[float, float] = (1.0, 1.0)
     spread: float = math.pi
     shadow: bool = True
+    _shape: Array = field(init=False, repr=False)
     _to_local: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Keep the inverse of the matrix; a lamp flattened by a scale of zero gets the nearest one that has one."""
-        matrix = np.asarray(self.matrix, np.float64)
-        object.__setattr__(self, "matrix", matrix)
+        """Keep what the lamp's scale makes of a cone, and its inverse."""
+        object.__setattr__(self, "matrix", np.asarray(self.matrix, np.float64))
         object.__setattr__(self, "power", np.asarray(self.power, np.float64))
-        object.__setattr__(self, "_to_local", np.linalg.pinv(matrix[:3, :3]))  # small
+        shape, inverse = _invertible(self.matrix[:3, :3])
+        object.__setattr__(self, "_shape", shape)
+        object.__setattr__(self, "_to_local", inverse)
 
     @property
     def position(self) -> Array:
@@ -75,7 +80,7 @@ class LocalLight:
 
     @property
     def to_local(self) -> Array:
-        """Turns and scales world directions into the lamp's own space: (3, 3)."""
+        """Turns world directions into the lamp's own space, with its scale up to a factor: (3, 3)."""
         return self._to_local
 
     @property
@@ -174,12 +179,11 @@ class LocalLight:
         """
         local, weights = _product_rule(self._kinks())
         if self.kind == "spot":
-            linear = self.matrix[:3, :3]
+            linear = self._shape
             turned = multiply(local, linear.T)
             length = np.sqrt(np.sum(turned ** 2, axis=1))
             determinant = abs(float(np.sum(np.cross(linear[:, 0], linear[:, 1]) * linear[:, 2])))
-            safe = np.maximum(length, np.finfo(np.float64).tiny)
-            return turned / safe[:, None], weights * determinant / safe ** 3
+            return turned / length[:, None], weights * determinant / length ** 3
         frame = _frame(self.axis)
         return multiply(-local, frame), weights  # local -Z is the frame's third row
 
@@ -192,6 +196,19 @@ class LocalLight:
         edge = math.cos(0.5 * self.spot_angle)
         inner = edge + (1.0 - edge) * self.spot_blend
         return [edge, inner, 1.0] if edge < inner < 1.0 else [edge, 1.0]
+
+
+def _invertible(linear: Array) -> tuple[Array, Array]:
+    """The matrix (3, 3) over its largest stretch and the inverse of that.
+
+    Stretches below FLATTEST are raised to it, so a lamp that a scale of zero flattens gets the thinnest cone that can
+    be reckoned with; scaled to nothing altogether, it keeps its shape and shines along -Z.
+    """
+    left, stretches, right = linalg.svd(linear)
+    if not stretches[0] > 0.0:
+        return np.eye(3), np.eye(3)
+    stretches = np.maximum(stretches / stretches[0], FLATTEST)
+    return (left * stretches) @ right, (right.T / stretches) @ left.T  # small
 
 
 def _window(shares: Array, negative: float) -> Array:

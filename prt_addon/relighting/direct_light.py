@@ -32,13 +32,23 @@ Single = NDArray[np.float32]
 BLOCK = 4096
 # A lamp nearer than this is held at it: single precision knows no smaller distance inside the scene's unit box.
 NEAREST = 6e-8
-# Points without rays by which a spot's edge across a wide lamp, and a grid's shade on an Area, are integrated.
-FINE = 192
-# Within this many half widths of an Area its irradiance comes from Lambert's formula; beyond, its points are within
-# 1e-3 of that.
-NEAR = 6.0
+# A lamp farther away, in diagonals of the scene, gives nothing: 1e9 W would give a scene of a millimetre 1e-17 W/m^2;
+# squares of still larger distances leave single precision.
+FARTHEST = 1e15
+# The share of a ball's radius by which rounding may put a receiver on its surface inside or outside of it.
+SURFACE = 1e-5
+# Points without rays by which a spot's edge across a wide lamp, and a grid's shade on an Area, are integrated: FINE
+# where the light leaps between them, SMOOTH where it does not.
+FINE, SMOOTH = 192, 32
+# Such points taken at once: fewer calls of numpy, and the arrays stay in the cache.
+AT_ONCE = 8
+# Within this many half widths of an Area its irradiance comes from Lambert's formula; beyond, four points that are
+# exact for polynomials of degree 3 are within 1e-3 of that.
+NEAR = 5.0
+FAR_POINTS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]], np.float32)
+FAR_REACH = {"rectangle": math.sqrt(1.0 / 3.0), "ellipse": 0.5}
 # Sides of the polygon of equal area that stands for an ellipse there.
-SIDES = 24
+SIDES = 16
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,11 @@ class LitReceivers:
         origins = tracer.to_tracing_space(starts)
         return LitReceivers(origins, _by_axis(origins), _by_axis(normals))
 
+    def taken(self, order: NDArray[np.integer]) -> LitReceivers:
+        """The receivers in this order, without their faces."""
+        return LitReceivers(np.ascontiguousarray(self.origins[order]), np.ascontiguousarray(self.places[:, order]),
+                            np.ascontiguousarray(self.normals[:, order]))
+
     def __len__(self) -> int:
         return len(self.origins)
 
@@ -111,10 +126,19 @@ def direct_local_light(tracer: Tracer, receivers: LitReceivers | ReceiverSet, li
 def sample_count(extent: float, distance: float, samples: int) -> int:
     """Points for a lamp of this half width seen from a typical distance: 1 for none, all of them from a tenth of the
     distance on, at least 4 where it throws any soft shadow. The sides of a penumbra show 1 / count steps of the light,
-    and a lamp half as wide throws one half as wide."""
+    and a lamp half as wide throws one half as wide. In halves, because every other count is another set of points, at
+    which a shadow leaps while the lamp moves."""
     if extent <= 0.0 or samples <= 1:
         return 1
-    return int(min(samples, max(4, math.ceil(samples * min(1.0, 10.0 * extent / max(distance, 1e-30))))))
+    wanted = samples * min(1.0, 10.0 * extent / max(distance, 1e-30))
+    while samples >= 8 and 0.5 * samples >= wanted:
+        samples //= 2
+    return samples
+
+
+def has_grid(light: LocalLight) -> bool:
+    """Whether an Area light's spread is less than all directions."""
+    return light.kind == "area" and light.spread < math.pi - 2e-6
 
 
 def _by_axis(vectors: NDArray[np.floating]) -> Single:
@@ -131,41 +155,51 @@ def _in_threads(tracer: Tracer, work: Callable, items: list) -> Iterable:
 @dataclass(frozen=True, eq=False)
 class _Source:
     """A lamp in tracing space. colour: (3,) float64, what one unit of `_Aimed.unshadowed` is worth; least: the smallest
-    such unit that counts; points: (n, 2) of its unit disc or square; fine: more of them."""
+    such unit that counts; points: (n, 2) of its unit disc or square; fine, smooth: more of them, see above; stretch:
+    the largest over the least that its scale does to a length."""
 
     light: LocalLight
     centre: Single
     axis: Single
     half_axes: Single
     to_local: Single
+    stretch: float
     radius: float
     extent: float
     colour: NDArray[np.float64]
     least: float
     points: Single
     fine: Single
+    smooth: Single
 
     @staticmethod
     def of(light: LocalLight, tracer: Tracer, receivers: LitReceivers, samples: int, seed: int,
            cutoff: float) -> _Source:
         """Bring a lamp to tracing space. Irradiance of a unit there is 1 / diagonal^2 of one in the world."""
-        centre = tracer.to_tracing_space(light.position[None])[0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            centre = tracer.to_tracing_space(light.position[None])[0]
+        lost = not np.all(np.abs(centre) < FARTHEST)
+        if lost:
+            centre = np.zeros(3, np.float32)
         extent = light.extent / tracer.diagonal
         if extent < NEAREST:
             extent = 0.0  # thinner than single precision tells apart: a point
         some = receivers.places[:, ::max(1, len(receivers) // 512)]
         typical = float(np.median(_length(some - centre[:, None]))) if some.size else 0.0
         count = sample_count(extent, typical, samples)
-        spread = fibonacci_square if light.kind == "area" and light.shape == "rectangle" else fibonacci_disc
+        # what a grid lets be seen of an ellipse is cut out of a rectangle (`_Face`)
+        square = light.kind == "area" and (light.shape == "rectangle" or has_grid(light))
+        spread = fibonacci_square if square else fibonacci_disc
         # E / pi = I cos / (pi d^2), for every kind of lamp from afar
-        colour = light.peak_intensity / (math.pi * tracer.diagonal ** 2)
+        colour = light.peak_intensity * (0.0 if lost else 1.0 / (math.pi * tracer.diagonal ** 2))
         brightest = float(np.max(np.abs(colour), initial=0.0))
-        scale = float(np.sqrt(np.sum(light.to_local ** 2))) or 1.0
+        scale = float(np.sqrt(np.sum(light.to_local ** 2)))
         return _Source(light, centre, light.axis.astype(np.float32),
                        (light.half_axes / tracer.diagonal).astype(np.float32),
-                       (light.to_local / scale).astype(np.float32), extent if light.kind != "area" else 0.0, extent,
-                       colour, cutoff / brightest if brightest > 0.0 else 0.0, spread(count, seed).astype(np.float32),
-                       spread(FINE, seed).astype(np.float32))
+                       (light.to_local / scale).astype(np.float32), float(np.linalg.cond(light.to_local)),  # small
+                       extent if light.kind != "area" else 0.0, extent, colour,
+                       cutoff / brightest if brightest > 0.0 else 0.0,
+                       *(spread(number, seed).astype(np.float32) for number in (count, FINE, SMOOTH)))
 
 
 @dataclass(frozen=True)
@@ -244,7 +278,7 @@ def _aim(source: _Source, places: Single, normals: Single) -> _Aimed:
 
 def _aim_at_point(source: _Source, towards: Single, distance: Single, height: Single) -> _Aimed:
     """A lamp without extent: intensity cos / d^2."""
-    value = np.maximum(height, 0.0) / (distance * distance * distance)
+    value = np.maximum(height, 0.0) / distance / (distance * distance)
     if source.light.kind == "spot":
         value *= _spot_share(source, towards)
     chosen = np.flatnonzero(value > source.least)
@@ -263,10 +297,15 @@ def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: S
     square = distance.astype(np.float64) ** 2
     sine_squared = radius ** 2 / (square + radius ** 2) if soft else np.minimum(radius ** 2 / square, 1.0)
     value = cap_irradiance(sine_squared, np.clip(height / distance, -1.0, 1.0).astype(np.float64))
-    inside = np.zeros(len(distance), bool) if soft else distance < radius
+    inside = np.zeros(len(distance), bool) if soft else distance < radius * (1.0 + SURFACE)
     value[inside] = math.pi  # the sphere shines on both sides: all around the receiver
     value /= math.pi * radius ** 2
     chosen = np.flatnonzero(value > source.least)
+    if source.light.kind == "spot":
+        dark, sharp, soft_edge = _cone_edges(source, np.take(towards, chosen, axis=1), sine_squared[chosen])
+        ball = inside[chosen]  # where it has no cone (Cycles: half of one, see the tests)
+        kept = ~dark | ball
+        chosen, edges = chosen[kept], [(edge & ~ball)[kept] for edge in (sharp, soft_edge)]
     if not len(chosen):
         return _nothing()
     far, middle = distance[chosen], np.take(towards, chosen, axis=1).T
@@ -276,17 +315,19 @@ def _aim_at_sphere(source: _Source, towards: Single, distance: Single, height: S
     to_disc = far - within
     directions = _disc_points(frames, to_disc, rim, source.points)
     facing = np.ascontiguousarray(np.take(normals, chosen, axis=1).T)
-    weights = _heights(directions, facing) * to_disc / _fourth_power(directions)
+    square = _squares(directions)
+    weights = _heights(directions, facing) / square * (to_disc / square)
     where = np.flatnonzero(inside[chosen])
     if len(where):
         _aim_from_inside(source, where, middle[where], facing[where], directions, weights)
     value = value[chosen].astype(np.float32)
-    if source.light.kind == "spot":
-        outside = np.flatnonzero(~inside[chosen])  # from inside the sphere Cycles knows no cone
-        value[outside] *= _spot_edge(source, frames[outside], to_disc[outside], rim[outside], facing[outside])
-        share = _spot_share(source, directions.reshape(-1, 3).T).reshape(weights.shape)
-        share[:, where] = 1.0
-        weights = weights * share
+    for edge, rule in zip(edges, (source.fine, source.smooth), strict=True) if source.light.kind == "spot" else ():
+        some = np.flatnonzero(edge)
+        if not len(some):
+            continue
+        value[some] *= _spot_edge(source, rule, frames[some], to_disc[some], rim[some], facing[some])
+        parted = directions[:, some]
+        weights[:, some] *= _spot_share(source, parted.reshape(-1, 3).T).reshape(parted.shape[:2])
     return _Aimed(chosen, value, directions, weights)
 
 
@@ -312,22 +353,62 @@ def _aim_from_inside(source: _Source, where: NDArray[np.int64], middle: Single, 
 
 def _spot_share(source: _Source, towards: Single) -> Single:
     """A spot's intensity towards receivers as a share of its peak; towards: (3, n), from receivers to the lamp."""
+    return spot_pattern(_spot_cosine(source, towards), source.light.spot_angle, source.light.spot_blend)
+
+
+def _spot_cosine(source: _Source, towards: Single) -> Single:
+    """The cosine to a spot's axis in its own space."""
     rows = source.to_local
     x, y, z = (rows[k, 0] * towards[0] + rows[k, 1] * towards[1] + rows[k, 2] * towards[2] for k in range(3))
     length = np.sqrt(x * x + y * y + z * z)
     # towards the receiver is the other way, and the lamp looks along -Z: two signs that cancel
-    cosine = np.divide(z, length, out=np.zeros_like(length), where=length > 0.0)
-    return spot_pattern(cosine, source.light.spot_angle, source.light.spot_blend)
+    return np.divide(z, length, out=np.zeros_like(length), where=length > 0.0)
 
 
-def _spot_edge(source: _Source, frames: Single, distance: Single, radius: Single, normals: Single) -> Single:
-    """Mean share (c,) of a spot's light across a wide lamp, whose points the edge of the cone parts: by FINE points."""
+def _cone_edges(source: _Source, towards: Single, sine_squared: NDArray[np.float64],
+                ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which receivers (c,) are wholly outside a wide spot's cone, and which neither outside nor wholly in full light:
+    those for which the lamp is wider than the cone's blend, and the others.
+
+    towards: (3, c), to the lamp's middle; sine_squared: (c,) of the angle that its radius fills, which the lamp's scale
+    widens in its own space at most by the ratio of its stretches.
+    """
+    light = source.light
+    angle = np.arccos(np.clip(_spot_cosine(source, towards), -1.0, 1.0))
+    wide = source.stretch * np.arcsin(np.sqrt(sine_squared)) + 1e-3  # and rounding
+    outer = 0.5 * light.spot_angle
+    inner = math.acos(math.cos(outer) + (1.0 - math.cos(outer)) * light.spot_blend)
+    dark = angle - wide > outer
+    edge = ~dark & (angle + wide > inner)
+    sharp = 2.0 * wide > outer - inner
+    return dark, edge & sharp, edge & ~sharp
+
+
+def _spot_edge(source: _Source, points: Single, frames: Single, distance: Single, radius: Single,
+               normals: Single) -> Single:
+    """Mean share (c,) of a spot's light across a wide lamp, whose points the edge of the cone parts: by those (n, 2).
+
+    Everything is linear in a point (u, v) of the disc: height, and the place in the lamp's own space.
+    """
+    middle, first, second = frames[:, 2] * distance[:, None], frames[:, 0] * radius[:, None], \
+        frames[:, 1] * radius[:, None]
+    to_local = source.to_local.T
+    local = [multiply(vector, to_local).T for vector in (middle, first, second)]
+    heights = [np.sum(vector * normals, axis=1) for vector in (middle, first, second)]
+    scale = np.float32(1.0 / math.sqrt(3.0)) if source.stretch < 1.0 + 1e-5 else None  # of an even `to_local`
     got, whole = np.zeros(len(distance), np.float32), np.zeros(len(distance), np.float32)
-    for start in range(0, FINE, 16):
-        directions = _disc_points(frames, distance, radius, source.fine[start:start + 16])
-        weights = _heights(directions, normals) / _fourth_power(directions)
-        got += np.sum(weights * _spot_share(source, directions.reshape(-1, 3).T).reshape(weights.shape), axis=0)
-        whole += np.sum(weights, axis=0)
+    for start in range(0, len(points), AT_ONCE):
+        u, v = points[start:start + AT_ONCE].T[:, :, None]
+        height = np.maximum(heights[0] + u * heights[1] + v * heights[2], 0.0)
+        square = np.maximum(distance * distance + (u * u + v * v) * (radius * radius), np.float32(NEAREST ** 2))
+        weight = height / square * (distance / square)
+        x, y, z = (local[0][k] + u * local[1][k] + v * local[2][k] if k == 2 or scale is None else 0.0
+                   for k in range(3))
+        length = np.sqrt(square) * scale if scale is not None else np.sqrt(
+            np.maximum(x * x + y * y + z * z, np.finfo(np.float32).tiny))
+        share = spot_pattern(z / length, source.light.spot_angle, source.light.spot_blend)
+        got += np.sum(weight * share, axis=0)
+        whole += np.sum(weight, axis=0)
     return np.divide(got, whole, out=np.zeros_like(got), where=whole > 0.0)
 
 
@@ -344,10 +425,10 @@ def _aim_at_face(source: _Source, places: Single, normals: Single) -> _Aimed:
     face = _Face.of(source, np.ascontiguousarray(np.take(away, chosen, axis=1).T), depth[chosen],
                     np.ascontiguousarray(np.take(normals, chosen, axis=1).T))
     directions, weights = face.look_at(source.points)
-    value = face.part * np.mean(weights, axis=0)
     if face.narrow:
-        value = face.part * face.mean_weight(source.fine)
+        value = face.part * face.mean_weight(source.fine if source.light.shape == "ellipse" else source.smooth)
     else:
+        value = face.mean_weight(np.float32(FAR_REACH[source.light.shape]) * FAR_POINTS)
         near = np.flatnonzero(np.sum(face.away ** 2, axis=1) < (NEAR * source.extent) ** 2)
         if len(near):
             value[near] = face.exact(near)
@@ -378,7 +459,7 @@ class _Face:
         count = len(depth)
         middle, half = np.zeros((count, 2), np.float32), np.ones((count, 2), np.float32)
         opening = 0.5 * max(source.light.spread, LEAST_SPREAD)
-        narrow = opening < 0.5 * math.pi - 1e-6
+        narrow = has_grid(source.light)
         size = np.sqrt(np.sum(source.half_axes.astype(np.float64) ** 2, axis=1))
         if narrow and abs(float(np.sum(source.half_axes[0] * source.half_axes[1]))) < 1e-3 * size[0] * size[1]:
             reach = depth * math.tan(opening)
@@ -399,19 +480,37 @@ class _Face:
         place = self.middle + points[:, None, :] * self.half
         first, second = self.source.half_axes
         directions = place[..., :1] * first + place[..., 1:] * second - self.away
-        weights = _heights(directions, self.normals) * self.depth / _fourth_power(directions)
+        square = _squares(directions)
+        weights = _heights(directions, self.normals) / square * (self.depth / square)
         if self.narrow:
-            length = np.sqrt(np.sum(directions ** 2, axis=2))
-            weights *= spread_pattern(self.depth / length, self.source.light.spread)
+            weights *= spread_pattern(self.depth / np.sqrt(square), self.source.light.spread)
             if self.source.light.shape == "ellipse":
                 weights *= np.sum(place ** 2, axis=2) <= 1.0
         return directions, weights
 
     def mean_weight(self, points: Single) -> Single:
-        """The mean (c,) of the weights of many points."""
+        """The mean (c,) of the weights of many points, as `look_at` gives them, in the face's own plane."""
+        along, across, (first, second, slant) = _plane_frame(self.source)
+        middle_x = self.middle[:, 0] * first + self.middle[:, 1] * slant - _dot(self.away, along)
+        middle_y = self.middle[:, 1] * second - _dot(self.away, across)
+        level = -self.depth * _dot(self.normals, self.source.axis)
+        normal_x, normal_y = _dot(self.normals, along), _dot(self.normals, across)
+        flat = 1.0 / (self.depth * np.float32(math.tan(0.5 * max(self.source.light.spread, LEAST_SPREAD))))
+        u_x, v_x, v_y = self.half[:, 0] * first, self.half[:, 1] * slant, self.half[:, 1] * second
         total = np.zeros(len(self.depth), np.float32)
-        for start in range(0, len(points), 16):
-            total += np.sum(self.look_at(points[start:start + 16])[1], axis=0)
+        for start in range(0, len(points), AT_ONCE):
+            u, v = points[start:start + AT_ONCE].T[:, :, None]
+            x, y = middle_x + u * u_x + v * v_x, middle_y + v * v_y
+            aside = x * x + y * y
+            square = np.maximum(aside + self.depth * self.depth, np.float32(NEAREST ** 2))
+            height = np.maximum(normal_x * x + normal_y * y + level, 0.0)
+            weight = height / square * (self.depth / square)
+            if self.narrow:
+                weight *= np.maximum(1.0 - np.sqrt(aside) * flat, 0.0)
+                if self.source.light.shape == "ellipse":
+                    weight *= (self.middle[:, 0] + u * self.half[:, 0]) ** 2 + (
+                        self.middle[:, 1] + v * self.half[:, 1]) ** 2 <= 1.0
+            total += np.sum(weight, axis=0)
         return total / len(points)
 
     def exact(self, near: NDArray[np.int64]) -> Single:
@@ -431,6 +530,20 @@ class _Face:
         return (polygon_irradiance(corners, self.normals[near].astype(np.float64)) / area).astype(np.float32)
 
 
+def _plane_frame(source: _Source) -> tuple[Single, Single, tuple[np.float32, np.float32, np.float32]]:
+    """Two unit vectors of an Area's plane, and its half axes in them: (first, 0) and (slant, second)."""
+    first, second = source.half_axes
+    length = np.sqrt(np.sum(first * first))
+    along = first / length
+    across = np.cross(source.axis, along).astype(np.float32)
+    return along, across, (length, np.sum(second * across), np.sum(second * along))
+
+
+def _dot(vectors: Single, direction: Single) -> Single:
+    """Products (c,) of vectors (c, 3) with one direction."""
+    return vectors[:, 0] * direction[0] + vectors[:, 1] * direction[1] + vectors[:, 2] * direction[2]
+
+
 def _nothing() -> _Aimed:
     return _Aimed(np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros((1, 0, 3), np.float32),
                   np.zeros((1, 0), np.float32))
@@ -446,7 +559,7 @@ def _heights(directions: Single, normals: Single) -> Single:
     return np.maximum(sum(directions[..., k] * normals[:, k] for k in range(3)), 0.0)
 
 
-def _fourth_power(directions: Single) -> Single:
-    """Lengths to the fourth power (n, c); held at NEAREST."""
+def _squares(directions: Single) -> Single:
+    """Squared lengths (n, c) of directions (n, c, 3); held at those of NEAREST."""
     square = directions[..., 0] ** 2 + directions[..., 1] ** 2 + directions[..., 2] ** 2
-    return np.maximum(square, np.float32(NEAREST ** 2)) ** 2
+    return np.maximum(square, np.float32(NEAREST ** 2))

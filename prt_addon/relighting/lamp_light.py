@@ -19,6 +19,7 @@ from ..lighting.light_cloud import LightCloud
 from ..lighting.light_fading import FADE_SECONDS, FadingWeights
 from ..lighting.light_interpolation import NEAREST, CloudInterpolator
 from ..lighting.local_lights import LocalLight
+from ..scene.receivers import morton_order
 from ..tracing.tracer import Tracer
 from .direct_light import LitReceivers, direct_local_light
 from .exit_radiance import Baked
@@ -98,11 +99,14 @@ class DirectLight:
 
     def __init__(self, tracer: Tracer, baked: Baked, samples: int = SHADOW_SAMPLES) -> None:
         self._tracer, self._samples = tracer, samples
-        self._receivers = LitReceivers.of_mesh(tracer, baked.positions, baked.normals, baked.triangles)
+        # Neighbours trace alike: up to a quarter faster than in the mesh's order (benchmarks/direct_light.py).
+        self._order = morton_order(baked.positions)
+        receivers = LitReceivers.of_mesh(tracer, baked.positions, baked.normals, baked.triangles)
+        self._receivers = receivers.taken(self._order)
         self._rows = baked.bases.shape[2]
 
     def of(self, lamps: Sequence[LocalLight]) -> NDArray[np.float32]:
         """(points, rows, 3) float32: what they add to the exit radiance, in row 0 for unit albedo."""
         result = np.zeros((len(self._receivers), self._rows, 3), np.float32)
-        result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+        result[self._order, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
         return result

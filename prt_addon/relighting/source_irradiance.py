@@ -20,8 +20,7 @@ def cap_irradiance(sine_squared: Array, cosine: Array) -> Array:
     sine_squared: (n,) of its angular radius a, at most a right angle; cosine: (n,) of the angle b between its middle
     and the receiver's normal. Lower, the cap's rim projects to an ellipse about cos(a) sin(b) with half-axes
     sin(a) |cos b| and sin(a); it meets the horizon's unit circle at the azimuths +-f, cos f = cos(a) / sin(b). What is
-    seen is the
-    circle's segment beyond these two points, f - sin f cos f, and the ellipse's part before them,
+    seen is the circle's segment beyond these two points, f - sin f cos f, and the ellipse's part before them,
     sin^2(a) cos(b) (g - sin g cos g) with cos g = -cot(a) cot(b); behind the horizon (b > 90 degrees) that part is
     negative. tests/core/test_local_lamps.py compares with quadrature.
     """
