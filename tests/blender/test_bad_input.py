@@ -81,7 +81,7 @@ def jobs(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 
 @dataclass(frozen=True)
 class Outcome:
-    """code: of the exit; lines: what was said beside progress and warnings; all: everything on stderr."""
+    """code: of the exit; lines: what was said beside progress, warnings and the error; all: everything on stderr."""
 
     code: int
     lines: list[str]
@@ -98,7 +98,8 @@ def prt(capfd: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
         capfd.readouterr()
         code = main([str(a) for a in arguments])
         text = capfd.readouterr().err
-        aside = tuple(f"prt: {name}" for name in (*STAGES.values(), "warning"))
+        # Beside what a bake says about its progress and its error, which is no complaint.
+        aside = tuple(f"prt: {name}" for name in (*STAGES.values(), "warning", "Total error", "The error was"))
         lines = [line for line in text.splitlines() if line.startswith("prt: ") and not line.startswith(aside)]
         assert "Traceback" not in text
         return Outcome(code, lines, text)
@@ -640,7 +641,8 @@ def test_odd_environments_light_linearly(pixels: np.ndarray, baked: Path, tmp_pa
     *(["bake", "--set", pair] for pair in (
         "order=0", "order=2.5", "order=", "=3", "order", "spacing=nan", "spacing=-1", "clusters=5000", "vectors=25",
         "encoder=best", "bounce_error=0", "fit_order_to_light=maybe", "seed=-1", "colour=red", "order=" + "9" * 5000)),
-    ["bake", "--preset", "ultra"], ["bake", "--objects", ","], ["bake", "--lighting", "local"], ["bake", "--bogus"],
+    ["bake", "--preset", "ultra"], ["bake", "--objects", ","], ["bake", "--lighting", "moon"], ["bake", "--bogus"],
+    ["bake", "--lighting", ""], ["bake", "--lighting", "local,moon"], ["bake", "--set", "lighting=moon"],
     ["bake", "--report", "r.txt"], ["bake", "--output", "x.txt"], ["bake", "--output", ""], ["relight"],
     ["bake", "--output", "LINK"],
 ], ids=lambda arguments: " ".join(arguments)[:40])
