@@ -59,6 +59,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   targets: Sequence[str] | None) -> dict[str, Any]:
     """What a bake of the scene would need, leave out and cost, as JSON-able values."""
     scene = read_scene(depsgraph, settings, targets)
+    settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
     plan = make_plan(scene, settings, reference_light(depsgraph))
     return {
         "objects": [o.name for o in scene.objects if o.is_target],
@@ -69,7 +70,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   "channels": plan.needs.channels, "order": plan.needs.order},
         "left_out": [asdict(item) for item in plan.needs.left_out],
         "hints": list(plan.needs.hints),
-        "warnings": list(scene.warnings),
+        "warnings": [*scene.warnings, *left_out],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
         "rays": sum(plan.rays.values()),
