@@ -329,6 +329,8 @@ ABOVE_FLOOR = (0.85, 0.95)
 SANE: dict[str, Sane] = {
     "zero-area faces": Sane(lambda: add("Z", [*CUBE, (0, 0, 5), (0, 0, 5), (1, 0, 5)], [*FACES, (8, 9, 10)]),
                             warns="dropped 1 zero-area"),
+    "a mesh without faces beside": Sane(lambda: (cube(), add("Dots", CUBE, [])), OPEN_CUBE, {"Cube"},
+                                        warns="Dots: the mesh has no faces"),
     "duplicate faces": Sane(lambda: add("D", CUBE, FACES + FACES), OPEN_CUBE, warns="12 duplicate"),
     "non-manifold": Sane(lambda: add("N", [(0, 0, 0), (0, 0, 1), (1, 0, 0), (-1, 1, 0), (-1, -1, 0)],
                                      [(0, 1, 2), (0, 1, 3), (0, 1, 4)])),

@@ -103,11 +103,12 @@ def test_analyze_prints_json_and_changes_nothing(scene: Path, capsys: pytest.Cap
 
 @pytest.mark.parametrize("lighting", ["environment", "local", "environment,local", "local,environment"])
 def test_every_kind_of_lighting_is_taken(lighting: str, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In any order, with the cost of what was asked for."""
+    """In any order, with the cost of what will be done: this scene has no lamp, and names no region for one."""
     assert run("analyze", "--input", scene, "--lighting", lighting, *FAST) == 0
     text = capsys.readouterr().out
     found = json.loads(text[text.index("{"):])
-    assert ("local" in found["stages"]) == ("local" in lighting)
+    assert ("local" in found["stages"]) == (lighting == "local")
+    assert any("no lamp" in warning for warning in found["warnings"]) == ("," in lighting)
 
 
 def test_relight_gives_the_promised_arrays(baked: Path, tmp_path: Path) -> None:
