@@ -70,7 +70,8 @@ def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | N
 
     depsgraph: of the viewport (`context.evaluated_depsgraph_get()`). target_names: objects to store transfer for; None
     takes the selected ones with geometry, or all if none is selected or Blender runs in the background, without those
-    that have no faces. warnings: gets a line for everything left out. Raises BadScene, naming the object, where a target can't be baked.
+    that have no faces. warnings: gets a line for everything left out. Raises BadScene, naming the object, where a
+    target can't be baked.
     """
     warnings = [] if warnings is None else warnings
     with shown_as_in_render(depsgraph) as visible:

@@ -21,8 +21,10 @@ from .gather import Gather
 
 # Of the constant function y_0, whose value it is the inverse of: transfer times this is the share of the sky seen.
 _CONSTANT = np.sqrt(4.0 * np.pi)
-# A share that a few rays have found can be off by its own size, and the factor with it; no other is out of this range.
-SMALLEST_FACTOR, LARGEST_FACTOR = 0.5, 2.0
+# A share that few rays have found can be off by its own size: the light of one lucky ray must not stand for many that
+# missed. There is no such limit below 1, where a part of the light that was found is kept: only that makes sure that
+# white surfaces never return more light than there is.
+LARGEST_FACTOR = 2.0
 
 
 def balanced(gathered: Gather, constant_transfer: NDArray[np.float32]) -> Gather:
@@ -40,7 +42,7 @@ def balanced(gathered: Gather, constant_transfer: NDArray[np.float32]) -> Gather
                      np.sum(receivers.face_weights * 0.5 * (1.0 + cosines), axis=1), 1.0)
     surfaces = np.maximum(above - _CONSTANT * constant_transfer.astype(np.float64), 0.0)
     factor = np.divide(surfaces, gathered.shown, out=np.ones(len(surfaces)), where=gathered.shown > 0.0)
-    factor = np.clip(factor, SMALLEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
+    factor = np.minimum(factor, LARGEST_FACTOR).astype(np.float32)
     matrix = gathered.matrix
     data = matrix.data * np.repeat(factor, np.diff(matrix.indptr))
     return replace(gathered, matrix=sparse.csr_matrix((data, matrix.indices, matrix.indptr), shape=matrix.shape))

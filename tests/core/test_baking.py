@@ -112,7 +112,8 @@ def test_closed_room_at_099_converges_and_says_how():
 def test_snow_in_a_white_world_returns_no_more_light_than_there_is(directions):
     # Whatever the number of rays: a draft's used to make 1.058 of 1.
     snow = (0.99,) * 3
-    scene = SceneMesh.assemble([plane(size=4.0, albedo=snow), sphere(centre=(0, 0, 0.9), radius=0.8, albedo=snow)], 0.05)
+    meshes = [plane(size=4.0, albedo=snow), sphere(centre=(0, 0, 0.9), radius=0.8, albedo=snow)]
+    scene = SceneMesh.assemble(meshes, 0.05)
     settings = make_settings("draft", {"error_receivers": "0", "directions": directions, "gather_directions": "64"})
     check, = (s for s in exhaust(bake(scene, settings)).report["stability"] if s["check"].startswith("brightest"))
     assert check["verdict"] == "ok" and 0.98 < check["value"] < check["limit"] < 1.01
