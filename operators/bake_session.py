@@ -21,7 +21,7 @@ from ..prt_addon.baking import job as jobs
 from ..prt_addon.baking.local_lights import fit_to_lamps
 from ..prt_addon.baking.plan import make_plan
 from ..prt_addon.baking.process import BakeProcess
-from ..prt_addon.baking.recipe import BakeResult
+from ..prt_addon.baking.recipe import BakeResult, transport_settings
 from ..prt_addon.baking.settings import BakeSettings
 from ..prt_addon.blender.fingerprint import fingerprint, surroundings
 from ..prt_addon.blender.light_region import light_regions
@@ -63,7 +63,8 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   targets: Sequence[str] | None) -> dict[str, Any]:
     """What a bake of the scene would need, leave out and cost, as JSON-able values."""
     scene = read_scene(depsgraph, settings, targets)
-    plan = make_plan(scene, settings, reference_light(depsgraph))
+    settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
+    plan = make_plan(scene, transport_settings(settings), reference_light(depsgraph))
     return {
         "objects": [o.name for o in scene.objects if o.is_target],
         "casters": len(scene.objects),
@@ -73,7 +74,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   "channels": plan.needs.channels, "order": plan.needs.order},
         "left_out": [asdict(item) for item in plan.needs.left_out],
         "hints": list(plan.needs.hints),
-        "warnings": list(scene.warnings),
+        "warnings": [*scene.warnings, *left_out],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
         "rays": sum(plan.rays.values()),

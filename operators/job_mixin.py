@@ -26,6 +26,7 @@ STAGES = {
     "direct": "Shadows",
     "interreflection": "Bounced light",
     "glossy": "Highlights",
+    "local": "Local lights",
     "subsurface": "Light through bodies",
     "local": "Light of lamps",
     "encode": "Compressing",

@@ -14,7 +14,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..prt_addon.baking.settings import HIGHEST_ORDER, PRESETS
+from ..prt_addon.baking.settings import HIGHEST_ORDER, MOST_CLOUD_LIGHTS, PRESETS
 
 # Explicit numbers: files store them, so that a preset inserted later changes no old file.
 PRESET_ITEMS = (
@@ -22,11 +22,40 @@ PRESET_ITEMS = (
     ("standard", "Standard", "A minute or so: what most scenes need", 1),
     ("high", "High", "Several minutes and more memory: sharper shadows, errors below one per cent", 2),
 )
+LIGHTING_ITEMS = (
+    ("environment", "Environment", "World and Suns. Costs what order and shadows cost", 0),
+    ("local", "Local Lights", "Point, Spot and Area lamps that move after the bake, with the light that they bounce. "
+                              "Costs one more solution for each light of the cloud, and no highlights are baked", 1),
+    ("both", "Both", "World, Suns and lamps that move. Costs both bakes, and one set of data holds both", 2),
+)
+LIGHTINGS = {"environment": "environment", "local": "local", "both": "environment,local"}
+GLOSSY_ROWS_ITEMS = (
+    ("0", "None", "Only diffuse light: metal is black. The fastest, and the least data", 0),
+    ("4", "4 Functions", "A soft sheen. Costs as much as 4 diffuse bakes of the shiny objects", 1),
+    ("9", "9 Functions", "Rough metal and satin. Costs as much as 9 diffuse bakes of the shiny objects", 2),
+    ("16", "16 Functions", "Most plastics and metals. Costs as much as 16 diffuse bakes of the shiny objects", 3),
+    ("24", "24 Functions", "Sharper highlights. Costs as much as 24 diffuse bakes of the shiny objects", 4),
+    ("25", "25 Functions", "One function more than 24, for next to nothing gained: to compare with published data", 5),
+)
+# What presets differ in, and so fill in; the rest belongs to the scene rather than to the quality, and stays.
+QUALITY = ("order", "glossy_rows", "glossy_albedo", "cloud_lights", "merge_response")
+# What goes into a bake under its own name.
+OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "cloud_spacing", "zone_receivers")
+# Blender keeps floats in single precision.
+ROUNDING = 1e-6
 
 
 def _take_preset(settings: PRTSettings, _context: bpy.types.Context) -> None:
-    """Choosing a preset fills in the numbers below it."""
-    settings.order = PRESETS[settings.preset].order
+    """Choosing a preset fills in the numbers that presets differ in."""
+    preset = PRESETS[settings.preset]
+    for name in QUALITY:
+        value = getattr(preset, name)
+        setattr(settings, name, str(value) if name == "glossy_rows" else value)
+
+
+def _may_bound(_settings: PRTSettings, candidate: bpy.types.Object) -> bool:
+    """Whether an object can bound a region of lights; the bake says what is wrong with one that does not."""
+    return candidate.type in ("EMPTY", "MESH")
 
 
 def _redraw(_settings: PRTSettings, _context: bpy.types.Context) -> None:
@@ -69,10 +98,86 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "nothing where nothing rings",
     )
 
+    lighting: EnumProperty(
+        name="Lighting", items=LIGHTING_ITEMS, default="environment",
+        description="What will light the scene after the bake",
+    )
+
+    glossy_rows: EnumProperty(
+        name="Functions", items=GLOSSY_ROWS_ITEMS, default=str(PRESETS["standard"].glossy_rows),
+        description="Most functions of the view that a highlight gets; soft ones get fewer. More buys sharper "
+                    "highlights; time and data grow in proportion",
+    )
+    glossy_albedo: FloatProperty(
+        name="Least Share", min=0.0, max=1.0, precision=3, default=PRESETS["standard"].glossy_albedo,
+        description="Share of the light that a highlight must return to be baked; plastic returns 0.05 to 0.09, metal "
+                    "most of it. Lower buys fainter highlights, and makes their objects cost as much as shiny ones",
+    )
+    glossy_window: BoolProperty(
+        name="Soften Sharp Ones", default=PRESETS["standard"].glossy_window,
+        description="Highlights sharper than the order of the light reflect a softer light. Buys highlights without "
+                    "dark rings, costs some of their sharpness and no time",
+    )
+    subsurface: BoolProperty(
+        name="Translucency", default=PRESETS["standard"].subsurface,
+        description="Light that travels through skin, wax and marble. Costs seconds and three colour channels where a "
+                    "material has subsurface light, and nothing elsewhere",
+    )
+    coherence: FloatProperty(
+        name="Coherence", min=0.0, max=0.5, precision=3, default=PRESETS["standard"].coherence,
+        description="Share of the squared error that may be added so that fewer triangles lie in several clusters. "
+                    "Serves exports to renderers that draw cluster by cluster; the preview does not need it. 0 is off",
+    )
+
+    cloud_region: PointerProperty(
+        name="Region", type=bpy.types.Object, poll=_may_bound,
+        description="A cube empty, or a mesh hidden in renders, within which lamps will move. A small region buys a "
+                    "denser cloud at the same cost; empty takes the scene's free space",
+    )
+    cloud_collection: PointerProperty(
+        name="Regions", type=bpy.types.Collection,
+        description="Several regions: a collection of cube empties, or of meshes hidden in renders. Used where no "
+                    "single region is chosen",
+    )
+    cloud_lights: IntProperty(
+        name="Lights", min=1, max=MOST_CLOUD_LIGHTS, soft_max=1000, default=PRESETS["standard"].cloud_lights,
+        description="Most lights of the cloud. More follow a moving lamp more closely; each costs one more solution "
+                    "of the bounced light, and room on disk while baking",
+    )
+    cloud_spacing: FloatProperty(
+        name="Spacing", min=0.0, soft_max=10.0, precision=3, unit="LENGTH", default=PRESETS["standard"].cloud_spacing,
+        description="Distance between the lights of the cloud, in place of their number. Smaller follows a moving lamp "
+                    "more closely; half of it costs eight times as much. 0 is as Lights allow",
+    )
+    merge_response: FloatProperty(
+        name="Merge Below", min=0.0, soft_max=1.0, precision=3, default=PRESETS["standard"].merge_response,
+        description="Lights merge whose light differs less than this share of the brightest. Higher buys less data and "
+                    "faster relighting, at the price of less exact bounced light. 0 merges none",
+    )
+    zone_receivers: IntProperty(
+        name="Zone Size", min=0, soft_max=100_000, default=PRESETS["standard"].zone_receivers,
+        description="Most receivers of a zone; lights merge zone by zone. Smaller zones merge more lights far away and "
+                    "need less memory, but hold more bases. 0 is one zone",
+    )
+
     def overrides(self) -> dict[str, str]:
         """What these settings change in their preset, by name, as `make_settings` takes it."""
-        changed = {"order": str(self.order)} if self.order != PRESETS[self.preset].order else {}
-        return changed if self.bounces else {**changed, "bounces": "0"}
+        preset = PRESETS[self.preset]
+        changed = {name: _text(getattr(self, name)) for name in OWN_NAMES
+                   if abs(float(getattr(self, name)) - float(getattr(preset, name))) > ROUNDING}
+        if not self.bounces:
+            changed["bounces"] = "0"
+        if LIGHTINGS[self.lighting] != preset.lighting:
+            changed["lighting"] = LIGHTINGS[self.lighting]
+        region = self.cloud_region or self.cloud_collection
+        if region is not None:
+            changed["cloud_region"] = region.name
+        return changed
+
+
+def _text(value: float | str) -> str:
+    """A number, switch or word as on a command line; single precision has seven digits."""
+    return f"{value:.7g}" if isinstance(value, float) else str(value)
 
 
 class PRTBakedObject(bpy.types.PropertyGroup):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import textwrap
+from typing import ClassVar
 
 import bpy
 
@@ -32,6 +33,7 @@ class PRT_PT_bake(_Sidebar, bpy.types.Panel):
         column = layout.column()
         column.enabled = not session.running
         column.prop(settings, "preset")
+        column.prop(settings, "lighting")
         column.prop(settings, "order")
         column.prop(settings, "bounces")
         if session.running:
@@ -48,6 +50,65 @@ class PRT_PT_bake(_Sidebar, bpy.types.Panel):
             box = layout.box()
             for line in session.analysis.splitlines():
                 _wrapped(box, context, line)
+
+
+class _Expert(_Sidebar):
+    """A folded part of the bake's panel: what a preset has filled in, to be changed."""
+
+    bl_parent_id = "PRT_PT_bake"
+    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+
+    def column(self, context: bpy.types.Context) -> bpy.types.UILayout:
+        """A column for settings, greyed while a bake runs."""
+        self.layout.use_property_split = True
+        self.layout.use_property_decorate = False
+        column = self.layout.column()
+        column.enabled = not context.window_manager.prt.running
+        return column
+
+
+class PRT_PT_highlights(_Expert, bpy.types.Panel):
+    """What shiny and translucent materials get."""
+
+    bl_idname = "PRT_PT_highlights"
+    bl_label = "Highlights"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        settings, column = context.scene.prt, self.column(context)
+        column.active = settings.lighting != "local"  # the bounced light of lamps is diffuse
+        column.prop(settings, "glossy_rows")
+        shiny = column.column()
+        shiny.active = settings.glossy_rows != "0"
+        shiny.prop(settings, "glossy_albedo")
+        shiny.prop(settings, "glossy_window")
+        column.prop(settings, "subsurface")
+        coherent = column.column()
+        coherent.active = settings.lighting == "environment"  # it would move receivers out of their zones
+        coherent.prop(settings, "coherence")
+
+
+class PRT_PT_local_lights(_Expert, bpy.types.Panel):
+    """The cloud of lights that stands for lamps that move."""
+
+    bl_idname = "PRT_PT_local_lights"
+    bl_label = "Local Lights"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.scene.prt.lighting != "environment"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        settings, column = context.scene.prt, self.column(context)
+        column.prop(settings, "cloud_region")
+        several = column.column()
+        several.active = settings.cloud_region is None
+        several.prop(settings, "cloud_collection")
+        lights = column.column()
+        lights.active = settings.cloud_spacing == 0.0
+        lights.prop(settings, "cloud_lights")
+        column.prop(settings, "cloud_spacing")
+        column.prop(settings, "merge_response")
+        column.prop(settings, "zone_receivers")
 
 
 class PRT_PT_preview(_Sidebar, bpy.types.Panel):

@@ -27,7 +27,7 @@ from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
 # Raised whenever the same input would give other numbers, so that old stages are not mixed with new code.
-JOB_SCHEMA = 3
+JOB_SCHEMA = 4
 SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
 _SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents")
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")

@@ -36,6 +36,7 @@ from ..storage.files import intact, save_arrays
 from ..tracing.tracer import Tracer
 from ..transport.buried import buried_receivers, fill_buried
 from ..transport.direct import direct_transfer
+from ..transport.energy_balance import balanced
 from ..transport.gather import Gather, gather_operator
 from ..transport.glossy import GlossySurfaces, glossy_transfer, surface_frames
 from ..transport.hemisphere_visibility import HemisphereVisibility, VisibilityCoefficients
@@ -147,6 +148,7 @@ class _Bake:
             receivers, transfer, visibility = yield from self._direct(gathered)
         if gathered is not None:
             with self.timer.stage("interreflection"):
+                gathered = balanced(gathered, transfer[:, 0])
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
@@ -700,7 +702,7 @@ def _next_or_end(steps: Generator[float, None, Any]) -> tuple[float | None, Any]
 def _numbers_of(found: Any) -> Any:
     """A gather or an interreflection without its large arrays: what the report tells of it."""
     if isinstance(found, Gather):
-        return replace(found, receivers=None, matrix=None, hits=None)
+        return replace(found, receivers=None, matrix=None, hits=None, shown=None)
     return found if found is None else replace(found, transfer=None)
 
 
@@ -732,7 +734,8 @@ def decoded(encoding: Encoding, rows: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def _packed_gather(gathered: Gather) -> dict[str, NDArray]:
     matrix, hits = gathered.matrix, gathered.hits
-    packed = {"key": gathered.receivers.key, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+    packed = {"key": gathered.receivers.key, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr,
+              "shown": gathered.shown}
     return packed | ({f"hits_{name}": value for name, value in vars(hits).items()} if hits is not None else {})
 
 
@@ -748,7 +751,7 @@ def _unpack_gather(scene: SceneMesh, tracer: Tracer, arrays: dict[str, NDArray],
     matrix = sparse.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=size)
     hits = HitRecord(**{field.name: arrays[f"hits_{field.name}"] for field in fields(HitRecord)}) \
         if "hits_first" in arrays else None
-    return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS), hits)
+    return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS), hits, arrays["shown"])
 
 
 def exhaust(steps: Iterator[Progress]) -> BakeResult:

@@ -58,23 +58,31 @@ class _Gathered:
     scene_object: bpy.types.Object
     parts: dict[int, _Part] = field(default_factory=dict)
 
+    @property
+    def faces(self) -> int:
+        """Triangles of all its parts, each counted once."""
+        return sum(len(part.arrays.triangles) for part in self.parts.values())
+
 
 def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | None = None,
                  warnings: list[str] | None = None) -> list[ObjectMesh]:
     """Every object with geometry that a render shows, in world space (metres), each with all it instances.
 
     depsgraph: of the viewport (`context.evaluated_depsgraph_get()`). target_names: objects to store transfer for; None
-    takes the selected ones with geometry, or all if none is selected or Blender runs in the background. warnings: gets
-    a line for everything left out. Raises BadScene, naming the object, where a target can't be baked.
+    takes the selected ones with geometry, or all if none is selected or Blender runs in the background, without those
+    that have no faces. warnings: gets a line for everything left out. Raises BadScene, naming the object, where a
+    target can't be baked.
     """
     warnings = [] if warnings is None else warnings
     with shown_as_in_render(depsgraph) as visible:
         targets = _targets(depsgraph, visible, target_names)
         albedo_reader, surface_reader = AlbedoReader(depsgraph.scene, warnings), SurfaceReader(warnings)
         gathered = _gather(depsgraph, visible, (albedo_reader, surface_reader), warnings)
+        everything = target_names is None and not targets
+        if target_names is None:
+            _leave_out_empty(targets, gathered, warnings)
         _check_targets(targets, gathered, visible)
         albedo_reader.evaluate()
-        everything = target_names is None and not targets
         return [_joined(g, everything or name in targets) for name, g in gathered.items()]
 
 
@@ -179,6 +187,19 @@ def _check_finite(positions: NDArray[np.float32], name: str) -> None:
                        "Delete them, or mend the modifier that makes them")
 
 
+def _leave_out_empty(targets: dict[str, bpy.types.Object], gathered: dict[str, _Gathered],
+                     warnings: list[str]) -> None:
+    """Drop objects without faces, each with a warning, where others are left to bake: nobody asked for them by name,
+    and one forgotten point cloud must not stop the bake of a scene."""
+    candidates = [name for name in (targets or gathered) if name in gathered]
+    empty = [name for name in candidates if not gathered[name].faces]
+    if len(empty) == len(candidates):
+        return
+    for name in empty:
+        warnings.append(f"{gathered.pop(name).scene_object.name}: the mesh has no faces, so it is not baked")
+        targets.pop(name, None)
+
+
 def _check_targets(targets: dict[str, bpy.types.Object], gathered: dict[str, _Gathered],
                    visible: dict[str, bpy.types.Object]) -> None:
     """Raise BadScene for a target without faces or with a transform that flattens it, or where there is no mesh."""
@@ -186,8 +207,7 @@ def _check_targets(targets: dict[str, bpy.types.Object], gathered: dict[str, _Ga
         cause = "no mesh is visible in renders" if visible else "no object is visible in renders"
         raise BadScene("scene", cause, "Add a mesh object, or enable one for renders in the outliner")
     for name, target in (targets or {n: g.scene_object for n, g in gathered.items()}).items():
-        faces = sum(len(part.arrays.triangles) for part in gathered[name].parts.values()) if name in gathered else 0
-        if not faces:
+        if name not in gathered or not gathered[name].faces:
             raise BadScene(target.name, "the mesh has no faces" if name in gathered else "it has no mesh to bake",
                            "Add faces, or bake another object")
         if is_flattened(np.array(target.matrix_world, np.float64)):

@@ -38,7 +38,8 @@ class Gather:
 
     hit_share: mean share of a target's hemisphere that is not sky; back_share: of it the share showing backs of
     surfaces; lost_share: share of the whole operator that met receivers beyond the last generation or ignored backs
-    (treated as black); two_sided: backs were followed.
+    (treated as black); two_sided: backs were followed. shown: (r,) float32 share of each receiver's hemisphere that
+    shows surfaces, whatever becomes of their light: without face shares, lost ones included.
     """
 
     receivers: ReceiverSet
@@ -48,6 +49,7 @@ class Gather:
     lost_share: float
     two_sided: bool
     hits: HitRecord | None = None
+    shown: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -68,12 +70,13 @@ class _Task:
 
 @dataclass
 class _Entries:
-    """Entries of a block of rows, before duplicates are summed."""
+    """Entries of a block of rows, before duplicates are summed. shown: (b,) sum of a row without face shares."""
 
     row: list[NDArray[np.int64]]
     key: list[NDArray[np.int64]]
     value: list[NDArray[np.float32]]
     kept: list[KeptHits]
+    shown: NDArray[np.float64] | float = 0.0
 
 
 def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], directions: NDArray[np.float64],
@@ -88,6 +91,7 @@ def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], d
     recorder = None if wanted is None else HitRecorder(wanted)
     sets: list[ReceiverSet] = []
     rows: list[sparse.csr_matrix] = []
+    shown: list[NDArray[np.float32]] = []
     count = len(scene.points)
     known = np.zeros(2 * count, bool)
     new = np.unique(keys)
@@ -95,10 +99,11 @@ def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], d
     for generation in range(GENERATIONS):
         known[new] = True
         receivers = ReceiverSet.of_keys(scene, tracer, new)
-        part = yield from _trace(tracer, scene, receivers, directions, weights, group, seed + generation,
-                                 generation == 0, recorder)
+        part, filled = yield from _trace(tracer, scene, receivers, directions, weights, group, seed + generation,
+                                         generation == 0, recorder)
         sets.append(receivers)
         rows.append(part)
+        shown.append(filled)
         seen = np.zeros(len(known), bool)
         seen[part.indices] = True
         if generation == 0:
@@ -112,7 +117,7 @@ def gather_operator(tracer: Tracer, scene: SceneMesh, keys: NDArray[np.int64], d
     receivers = ReceiverSet.joined(sets)
     matrix, lost_share = _square(receivers.key, sparse.vstack(rows, format="csr"))
     return Gather(receivers, matrix, hit_share, back_share, lost_share, back_share > BACKS_IGNORED,
-                  None if recorder is None else recorder.result())
+                  None if recorder is None else recorder.result(), np.concatenate(shown))
 
 
 def _square(key: NDArray[np.int64], wide: sparse.csr_matrix) -> tuple[sparse.csr_matrix, float]:
@@ -131,9 +136,10 @@ def _square(key: NDArray[np.int64], wide: sparse.csr_matrix) -> tuple[sparse.csr
 
 def _trace(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, directions: NDArray[np.float64],
            weights: NDArray[np.float64], group: int, seed: int, report: bool, recorder: HitRecorder | None,
-           ) -> Generator[float, None, sparse.csr_matrix]:
-    """The operator's rows of these receivers, with keys as columns: (r, 2 points)."""
+           ) -> Generator[float, None, tuple[sparse.csr_matrix, NDArray[np.float32]]]:
+    """The operator's rows of these receivers, with keys as columns: (r, 2 points), and their sums `shown`."""
     finished: list[sparse.csr_matrix] = []
+    shown = np.zeros(len(receivers), np.float32)
     entries = _Entries([], [], [], [])
     done, total = 0, max(1, len(receivers) * len(directions))
 
@@ -147,18 +153,21 @@ def _trace(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, directions:
         entries.key += found.key
         entries.value += found.value
         entries.kept += found.kept
+        entries.shown = entries.shown + found.shown
         tracer.rays += rays
         done += (task.block.receivers.stop - task.block.receivers.start) * len(task.directions)
         if task.last_of_block:
             rows = task.block.receivers.stop - task.block.receivers.start
             finished.append(_block_matrix(entries, rows, 2 * len(scene.points)))
+            shown[task.block.receivers] = entries.shown
             if recorder is not None:
                 turned = rotated(directions, task.block.rotation).astype(np.float32)
                 recorder.add_block(task.block, turned, entries.kept)
             entries = _Entries([], [], [], [])
         if report:
             yield done / total
-    return sparse.vstack(finished, format="csr") if finished else sparse.csr_matrix((0, 2 * len(scene.points)))
+    whole = sparse.vstack(finished, format="csr") if finished else sparse.csr_matrix((0, 2 * len(scene.points)))
+    return whole, shown
 
 
 def face_shares(scene: SceneMesh) -> NDArray[np.float32]:
@@ -218,7 +227,8 @@ def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task)
     value = (np.stack([1.0 - u - v, u, v], axis=1) * share[:, None]).astype(np.float32)
     value *= np.take(task.face_shares, hits.triangle[met], axis=0)
     kept = [] if task.wanted is None or not task.wanted.any() else _kept(task, hits, met, which, row, share, above)
-    return _Entries([np.repeat(row, 3)], [corner.ravel()], [value.ravel()], kept), rays
+    return _Entries([np.repeat(row, 3)], [corner.ravel()], [value.ravel()], kept,
+                    np.bincount(row, share, cosines.shape[1])), rays
 
 
 def _kept(task: _Task, hits: Hits, met: NDArray[np.int64], which: NDArray[np.int64], row: NDArray[np.int64],

@@ -81,7 +81,7 @@ def jobs(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 
 @dataclass(frozen=True)
 class Outcome:
-    """code: of the exit; lines: what was said beside progress and warnings; all: everything on stderr."""
+    """code: of the exit; lines: what was said beside progress, warnings and the error; all: everything on stderr."""
 
     code: int
     lines: list[str]
@@ -98,7 +98,8 @@ def prt(capfd: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
         capfd.readouterr()
         code = main([str(a) for a in arguments])
         text = capfd.readouterr().err
-        aside = tuple(f"prt: {name}" for name in (*STAGES.values(), "warning"))
+        # Beside what a bake says about its progress and its error, which is no complaint.
+        aside = tuple(f"prt: {name}" for name in (*STAGES.values(), "warning", "Total error", "The error was"))
         lines = [line for line in text.splitlines() if line.startswith("prt: ") and not line.startswith(aside)]
         assert "Traceback" not in text
         return Outcome(code, lines, text)
@@ -328,6 +329,8 @@ ABOVE_FLOOR = (0.85, 0.95)
 SANE: dict[str, Sane] = {
     "zero-area faces": Sane(lambda: add("Z", [*CUBE, (0, 0, 5), (0, 0, 5), (1, 0, 5)], [*FACES, (8, 9, 10)]),
                             warns="dropped 1 zero-area"),
+    "a mesh without faces beside": Sane(lambda: (cube(), add("Dots", CUBE, [])), OPEN_CUBE, {"Cube"},
+                                        warns="Dots: the mesh has no faces"),
     "duplicate faces": Sane(lambda: add("D", CUBE, FACES + FACES), OPEN_CUBE, warns="12 duplicate"),
     "non-manifold": Sane(lambda: add("N", [(0, 0, 0), (0, 0, 1), (1, 0, 0), (-1, 1, 0), (-1, -1, 0)],
                                      [(0, 1, 2), (0, 1, 3), (0, 1, 4)])),
@@ -640,7 +643,8 @@ def test_odd_environments_light_linearly(pixels: np.ndarray, baked: Path, tmp_pa
     *(["bake", "--set", pair] for pair in (
         "order=0", "order=2.5", "order=", "=3", "order", "spacing=nan", "spacing=-1", "clusters=5000", "vectors=25",
         "encoder=best", "bounce_error=0", "fit_order_to_light=maybe", "seed=-1", "colour=red", "order=" + "9" * 5000)),
-    ["bake", "--preset", "ultra"], ["bake", "--objects", ","], ["bake", "--lighting", "local"], ["bake", "--bogus"],
+    ["bake", "--preset", "ultra"], ["bake", "--objects", ","], ["bake", "--lighting", "moon"], ["bake", "--bogus"],
+    ["bake", "--lighting", ""], ["bake", "--lighting", "local,moon"], ["bake", "--set", "lighting=moon"],
     ["bake", "--report", "r.txt"], ["bake", "--output", "x.txt"], ["bake", "--output", ""], ["relight"],
     ["bake", "--output", "LINK"],
 ], ids=lambda arguments: " ".join(arguments)[:40])

@@ -101,6 +101,16 @@ def test_analyze_prints_json_and_changes_nothing(scene: Path, capsys: pytest.Cap
     assert (digest(scene), sorted(scene.parent.iterdir())) == before
 
 
+@pytest.mark.parametrize("lighting", ["environment", "local", "environment,local", "local,environment"])
+def test_every_kind_of_lighting_is_taken(lighting: str, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In any order, with the cost of what will be done: this scene has no lamp, and names no region for one."""
+    assert run("analyze", "--input", scene, "--lighting", lighting, *FAST) == 0
+    text = capsys.readouterr().out
+    found = json.loads(text[text.index("{"):])
+    assert ("local" in found["stages"]) == (lighting == "local")
+    assert any("no lamp" in warning for warning in found["warnings"]) == ("," in lighting)
+
+
 def test_relight_gives_the_promised_arrays(baked: Path, tmp_path: Path) -> None:
     arrays = relit(baked, tmp_path / "c.npz")
     points = len(arrays["radiance"])
@@ -203,7 +213,8 @@ assert not hasattr(bpy.types.Scene, "prt")
     [], ["dance"], ["bake"], ["bake", "--input", "a.blend"], ["analyze", "--input", "absent.blend"],
     ["analyze", "--input", "SCENE", "--preset", "best"], ["analyze", "--input", "SCENE", "--set", "order"],
     ["analyze", "--input", "SCENE", "--set", "order=11"], ["analyze", "--input", "SCENE", "--set", "colour=red"],
-    ["analyze", "--input", "SCENE", "--lighting", "local"], ["analyze", "--inp", "SCENE"],
+    ["analyze", "--input", "SCENE", "--lighting", "moon"], ["analyze", "--input", "SCENE", "--lighting", ""],
+    ["analyze", "--input", "SCENE", "--lighting", "local,"], ["analyze", "--inp", "SCENE"],
     ["bake", "--input", "SCENE", "--output", "SCENE"], ["bake", "--input", "SCENE", "--output", "x.txt"],
     ["preview", "--input", "SCENE", "--output", "x.png", "--size", "64"],
     ["relight", "--input", "SCENE", "--output", "x.npz", "--rotate", "north"],

@@ -199,6 +199,20 @@ def test_bad_input_is_named(scene: bpy.types.Scene, make: Callable[..., object],
     assert caught.value.subject == name
 
 
+def test_an_object_without_faces_stops_the_bake_only_where_it_was_named(scene: bpy.types.Scene) -> None:
+    add_cube("Whole")
+    add_mesh("Points", TRIANGLE[0], [])
+    add_mesh("Empty", [], [])
+    warnings: list[str] = []
+    assert {o.name: o.is_target for o in read_objects(depsgraph(), None, warnings)} == {"Whole": True}
+    assert [w.split(":")[0] for w in warnings] == ["Points", "Empty"] and "no faces" in warnings[0]
+    with pytest.raises(BadScene, match="no faces") as caught:
+        read_objects(depsgraph(), ["Whole", "Points"])
+    assert caught.value.subject == "Points"
+    bystanders = {o.name: o.is_target for o in read_objects(depsgraph(), ["Whole"])}
+    assert bystanders.pop("Whole") and not any(bystanders.values())
+
+
 def test_a_flat_caster_is_fine(scene: bpy.types.Scene) -> None:
     add_cube("Target")
     add_cube("Flat").scale = (1, 1, 0)

@@ -108,6 +108,17 @@ def test_closed_room_at_099_converges_and_says_how():
     assert all(np.isfinite(s["value"]) for s in report["stability"])
 
 
+@pytest.mark.parametrize("directions", ["16", "256"])
+def test_snow_in_a_white_world_returns_no_more_light_than_there_is(directions):
+    # Whatever the number of rays: a draft's used to make 1.058 of 1.
+    snow = (0.99,) * 3
+    meshes = [plane(size=4.0, albedo=snow), sphere(centre=(0, 0, 0.9), radius=0.8, albedo=snow)]
+    scene = SceneMesh.assemble(meshes, 0.05)
+    settings = make_settings("draft", {"error_receivers": "0", "directions": directions, "gather_directions": "64"})
+    check, = (s for s in exhaust(bake(scene, settings)).report["stability"] if s["check"].startswith("brightest"))
+    assert check["verdict"] == "ok" and 0.98 < check["value"] < check["limit"] < 1.01
+
+
 def test_inward_normals_of_an_open_mesh_are_pointed_out():
     # A black hollow ball with one face missing whose normals point inside: a few receivers see a speck of sky.
     mesh = sphere(subdivisions=3, inward=True, albedo=(0, 0, 0))
