@@ -26,6 +26,7 @@ from ..compression.groups import encode_groups
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
+from ..linear_algebra import multiply
 from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
 from ..scene.needs import BLACK, GREY_TOLERANCE
@@ -45,7 +46,8 @@ from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
-from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
+from .lamp_surfaces import with_lamp_surfaces
+from .local_lights import LitHighlights, LocalTransfer, local_transfer, packed_local, unpacked_local
 from .plan import Plan, make_plan, most_clusters
 from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
 from .settings import BakeSettings
@@ -53,7 +55,7 @@ from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_wo
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
 POLL_SECONDS = 0.05
-# Shadow rays of a bake for local lights alone, where distant light only checks the scene.
+# Shadow rays of a bake for local lights alone without highlights, where distant light only checks the scene.
 DIRECTIONS_OF_CHECKS = 256
 # Receivers whose layers leave less of the diffuse one than this say nothing about its error.
 LEAST_DIFFUSE = 0.05
@@ -103,8 +105,7 @@ def transport_settings(settings: BakeSettings) -> BakeSettings:
     still tells what is buried, dark, or brighter than it can be."""
     if settings.distant_light:
         return settings
-    return replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS), error_receivers=0,
-                   glossy_rows=0, subsurface=False)
+    return replace(settings, order=1, error_receivers=0, subsurface=False)
 
 
 @dataclass
@@ -147,13 +148,13 @@ class _Bake:
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
         glossy, subsurface = None, []
-        if visibility is not None:
+        if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
                 glossy = yield from self._glossy(receivers, transfer, visibility, gathered)
         local = None
         if self.settings.local_light:
             with self.timer.stage("local"):
-                local = yield from self._local(gathered)
+                local = yield from self._local(gathered, visibility)
         # What later stages do not read is large: rays' hits, visibility, the operator.
         gathered, bounced, visibility = _numbers_of(gathered), _numbers_of(bounced), None
         transfer = self._by_point(receivers, transfer)
@@ -240,11 +241,14 @@ class _Bake:
     def _prepare(self) -> None:
         settings = self.settings
         self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
-        self.directions = quadrature(settings.directions, self.plan.needs.order)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
         self.glossy = self.surfaces.glossy_points(self.scene)
+        directions = settings.directions
+        if not settings.distant_light and not self.glossy.any():
+            directions = min(directions, DIRECTIONS_OF_CHECKS)
+        self.directions = quadrature(directions, self.plan.needs.order)
         self.translucent = self.surfaces.translucent_points(self.scene)
         keep = np.zeros(len(self.scene.points), bool)
         for target in self.targets:
@@ -310,12 +314,7 @@ class _Bake:
         stored = self._load("glossy")
         if stored is not None:
             return GlossyRows(points, stored[0]["rows"])
-        used = np.unique(scene.material[points])
-        kernels = tuple(self.surfaces.parts[number].kernel for number in used)
-        width = max(kernel.shape[2] for kernel in kernels)
-        kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
-        surfaces = GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
-                                  np.searchsorted(used, scene.material[points]), kernels, self.surfaces.functions)
+        surfaces = self._glossy_surfaces(points)
         frames, order = surfaces.frames, self.plan.needs.order
         indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
         first_round = 0.3 if self.glossy_bounce else 1.0
@@ -328,11 +327,22 @@ class _Bake:
             indirect = self._indirect(gathered, receivers, transfer, visibility, albedo, bounce)
             found = yield from self._follow("glossy", glossy_transfer(
                 self.tracer, surfaces, order, visibility.visible, indirect), first_round, 1.0)
-        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]] for number in used], np.float32)
+        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]]
+                            for number in np.unique(scene.material[points])], np.float32)
         if (windows < 1.0).any():
             found *= windows[surfaces.material][:, None, :, None]
         self._save("glossy", {"rows": found})
         return GlossyRows(points, found)
+
+    def _glossy_surfaces(self, points: NDArray[np.int64]) -> GlossySurfaces:
+        """What reflects at these points."""
+        scene = self.scene
+        used = np.unique(scene.material[points])
+        kernels = tuple(self.surfaces.parts[number].kernel for number in used)
+        width = max(kernel.shape[2] for kernel in kernels)
+        kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
+        return GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
+                              np.searchsorted(used, scene.material[points]), kernels, self.surfaces.functions)
 
     def _indirect(self, gathered: Gather | None, receivers: ReceiverSet, transfer: NDArray[np.float32],
                   visibility: VisibilityCoefficients, albedo: NDArray[np.float32], bounce: GlossyRadiance | None,
@@ -361,16 +371,21 @@ class _Bake:
         self._save("subsurface", *packed_bodies(bodies))
         return bodies
 
-    def _local(self, gathered: Gather | None) -> Generator[Progress, None, LocalTransfer]:
+    def _local(self, gathered: Gather | None, visibility: VisibilityCoefficients | None,
+               ) -> Generator[Progress, None, LocalTransfer]:
         """The transfer of local lights, by point."""
         stored = self._load("local")
         if stored is not None:
             return unpacked_local(*stored)
-        albedo = None
+        albedo = highlights = None
         if gathered is not None:
             albedo = self.albedo[gathered.receivers.key % len(self.scene.points)][:, :self.plan.needs.channels]
+            if visibility is not None and len(visibility.rows) and gathered.hits is not None:
+                points = gathered.receivers.key[visibility.rows]
+                highlights = LitHighlights(points, visibility.rows, self._glossy_surfaces(points), visibility.blocked)
         local = yield from self._follow("local", local_transfer(
-            self.tracer, self.scene, gathered, albedo, self.keys, self.regions, self.settings, self.folder))
+            self.tracer, self.scene, gathered, albedo, self.keys, self.regions, self.settings, self.folder,
+            highlights))
         self._save("local", *packed_local(local))
         return local
 
@@ -383,19 +398,31 @@ class _Bake:
         self.local = local
         if local is None:
             return
-        share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
-        distant = sum(float(np.sum(np.square(s, dtype=np.float64))) for s in signals.values())
-        near = float(np.sum(np.square(local.transfer[self.keys], dtype=np.float64)))
-        both = self.settings.distant_light and distant > 0.0 and near > 0.0
-        self.local_scale = np.sqrt(distant / near) if both else 1.0
+        columns, distant, near = 0, 0.0, 0.0
         for target in self.targets:
             before = signals[target.name]
             columns = before.shape[2] if self.settings.distant_light else 0
             joined = np.zeros((*before.shape[:2], columns + local.transfer.shape[1], before.shape[3]), np.float32)
             joined[:, :, :columns] = before[:, :, :columns]
-            dimmed = share[self.scene.material[target.points], None, None] * np.float32(self.local_scale)
-            joined[:, 0, columns:] = local.transfer[target.points] * dimmed
+            self._write_local(joined[:, :, columns:], target, local)
             signals[target.name] = joined
+            metric = row_metric(self.surfaces.functions_of_object(self.scene, target), self.scene.albedo[target.points])
+            distant += _energy(joined[:, :, :columns], metric)
+            near += _energy(joined[:, :, columns:], metric)
+        if distant > 0.0 and near > 0.0:
+            self.local_scale = np.sqrt(distant / near)
+            for signal in signals.values():
+                signal[:, :, columns:] *= np.float32(self.local_scale)
+
+    def _write_local(self, signal: NDArray[np.float32], target: SceneObject, local: LocalTransfer) -> None:
+        """A target's light of the cloud (p, rows, columns, channels), into zeros. Bodies are not translucent to it:
+        their subsurface light stays in the diffuse layer (`SurfacePart.lamp_share`)."""
+        share = np.array([part.lamp_share for part in self.surfaces.parts], np.float32)
+        material, diffuse = self.scene.material[target.points], local.transfer[target.points]
+        signal[:, 0] = diffuse * share[material, None, None]
+        if local.rows is not None and signal.shape[1] == 1 + local.rows.shape[1]:
+            GlossyRows(local.points, local.rows).write(signal[:, 1:], target.points)
+            self._add_dimming(signal, material, diffuse, self.scene.albedo[target.points])
 
     def _signals(self, transfer: NDArray[np.float32], glossy: GlossyRows | None,
                  subsurface: list[BodyLight]) -> dict[str, NDArray[np.float32]]:
@@ -614,6 +641,9 @@ class _Bake:
                                           self.digests.get(target.name, ""), self._local_columns(target.name))
             for target in self.targets
         }
+        if self.local is not None:
+            objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
+                       for target in self.targets}
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:
@@ -632,6 +662,19 @@ class _Bake:
         if self.local is None:
             return None
         return LocalColumns(self.local.cloud, self.cluster_zone[name], self.local_scale)
+
+
+def _energy(signal: NDArray[np.float32], metric: NDArray[np.float64] | None) -> float:
+    """Sum of squares of a signal (p, rows, columns, channels), in the metric of its rows."""
+    total = 0.0
+    for start in range(0, len(signal), ROWS_AT_ONCE):
+        block = signal[start:start + ROWS_AT_ONCE]
+        if metric is None:
+            total += float(np.sum(np.square(block, dtype=np.float64)))
+        else:
+            rows = np.moveaxis(block, 1, 0).reshape(len(metric), -1).astype(np.float64)
+            total += float(np.sum(multiply(metric, rows) * rows))
+    return total
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from ..lighting.local_lights import LocalLight
 from ..tracing.tracer import Tracer
 from .direct_light import LitReceivers, direct_local_light
 from .exit_radiance import Baked
+from .lamp_highlights import LampHighlights, LampSurfaces
 
 # Points of a lamp with a surface, at most: its indirect light hardly tells more apart.
 MOST_POINTS = 16
@@ -90,19 +92,36 @@ def _named(names: Sequence[str], chosen: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name, taken in zip(names, chosen, strict=True) if taken))
 
 
+class LitBake(Baked, Protocol):
+    """What direct light reads of storage's BakedTransfer."""
+
+    positions: NDArray[np.float32]
+    lamp_surfaces: LampSurfaces | None
+
+
 class DirectLight:
     """Direct light of lamps on one bake's receivers.
 
     tracer: of everything that casts shadows.
     """
 
-    def __init__(self, tracer: Tracer, baked: Baked, samples: int = SHADOW_SAMPLES) -> None:
+    def __init__(self, tracer: Tracer, baked: LitBake, samples: int = SHADOW_SAMPLES) -> None:
         self._tracer, self._samples = tracer, samples
         self._receivers = LitReceivers.of_points(tracer, baked.positions, baked.normals)
         self._rows = baked.bases.shape[2]
+        surfaces = baked.lamp_surfaces
+        self._highlights = None if surfaces is None else LampHighlights(
+            surfaces, baked.positions, baked.normals, baked.tangents, baked.albedo)
 
     def of(self, lamps: Sequence[LocalLight]) -> NDArray[np.float32]:
         """(points, rows, 3) float32: what they add to the exit radiance, in row 0 for unit albedo."""
         result = np.zeros((len(self._receivers), self._rows, 3), np.float32)
-        result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+        if self._highlights is None:
+            result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+            return result
+        for lamp in lamps:
+            light = direct_local_light(self._tracer, self._receivers, [lamp], self._samples)
+            result[:, 0] += light
+            self._highlights.add(result, lamp.position, light)
+        self._highlights.finish(result)
         return result
