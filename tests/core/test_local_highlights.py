@@ -148,7 +148,7 @@ def test_bounced_highlights_hardly_ring(lit_room):
                      axis=-1).reshape(-1, 3)
     seen = np.einsum("vf,gfc->vgc", hemisphere_values(tuple(lit_room.surfaces.functions), views), rows)
     assert seen.mean() > 0.0
-    assert seen.min() > -0.02 * seen.max()
+    assert seen.min() > 0.0
 
 
 def test_a_white_metal_ball_vanishes_in_a_room_of_even_light(lit_room):
@@ -205,8 +205,8 @@ def test_a_bake_ends_with_both_kinds_of_rows_and_a_joined_one_too():
 
 @pytest.mark.parametrize(("material", "rows", "limit"), [
     (replace(METAL, roughness=0.5), 16, 0.04), (replace(METAL, roughness=0.8), 9, 0.03),
-    (replace(METAL, roughness=0.5, anisotropic=0.5, anisotropic_rotation=0.1), 16, 0.12),
-    (replace(METAL, roughness=0.3), 16, 0.15)])
+    (replace(METAL, roughness=0.5, anisotropic=0.5, anisotropic_rotation=0.1), 16, 0.06),
+    (replace(METAL, roughness=0.3), 16, 0.1)])
 def test_a_lamps_kernel_is_the_best_fit_of_ggx(material, rows, limit):
     """Against least squares over views of the true highlight of each of many lamps: relative RMS over lamps and views,
     and the energy of all lamps together."""
@@ -222,7 +222,7 @@ def test_a_lamps_kernel_is_the_best_fit_of_ggx(material, rows, limit):
     found = values @ kernel @ (evaluate(LAMP_ORDER, lights) * lights[:, 2:] / np.pi).T
     weight = of_view[:, None] * views[:, 2:] * of_light
     assert np.sqrt(np.sum((found - best) ** 2 * weight)) < limit * np.sqrt(np.sum(true ** 2 * weight))
-    assert np.sum(found * weight) == pytest.approx(np.sum(true * weight), rel=0.02 + limit / 4)
+    assert np.sum(found * weight) == pytest.approx(np.sum(true * weight), rel=0.03)
 
 
 def rule(heights, azimuths):
@@ -276,8 +276,8 @@ def test_a_far_lamp_is_a_sun_in_its_direction():
     mesh = replace(sphere("ball", subdivisions=3, albedo=(0, 0, 0)), materials=(replace(METAL, roughness=0.7),))
     scene = SceneMesh.assemble([mesh])
     options = {"spacing": "0", "threads": "1", "order": "7", "directions": "1024", "error_receivers": "0",
-               "vectors": "24", "compression_error": "0", "clusters": "32", "encoder": "static", "lighting": "environment,local",
-               "glossy_window": "false", "cloud_lights": "1"}
+               "vectors": "24", "compression_error": "0", "clusters": "32", "encoder": "static",
+               "lighting": "environment,local", "glossy_window": "false", "cloud_lights": "1"}
     ball = exhaust(bake(scene, make_settings("standard", options))).objects["ball"]
     towards, distance = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8]), 300.0
     lamp = lamp_at(distance * towards)
@@ -291,7 +291,7 @@ def test_a_far_lamp_is_a_sun_in_its_direction():
     found = view_radiance(ball, 0 * light, views, direct)
     lit = ball.normals @ towards > 0.1  # the sun of seven bands shines a little around the edge
     assert expected[lit].mean() > 0.0
-    assert np.sqrt(np.mean((found - expected)[lit] ** 2)) < 0.04 * np.sqrt(np.mean(expected[lit] ** 2))
+    assert np.sqrt(np.mean((found - expected)[lit] ** 2)) < 0.03 * np.sqrt(np.mean(expected[lit] ** 2))
 
 
 @pytest.mark.parametrize("kind", ["point", "wide"])
@@ -323,7 +323,7 @@ def test_direct_rows_against_ggx(kind):
         expected = best * light[lit, channel]
         weight = of_view[:, None] * views[:, 2:]
         error = np.sqrt(np.sum((found - expected) ** 2 * weight) / np.sum(expected ** 2 * weight))
-        assert error < 0.1  # 16 rows under the window against ringing; 0.03 without
+        assert error < 0.05
 
 
 def test_two_lamps_add_up_and_a_broken_store_is_refused():
