@@ -8,7 +8,7 @@ direction in the receiver's frame to rows of exit radiance, for the irradiance t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..linear_algebra import multiply
 Single = NDArray[np.float32]
 
 # Receivers whose arrays stay in the cache.
-BLOCK = 2048
+BLOCK = 1024
 
 
 @dataclass(frozen=True)
@@ -51,50 +51,57 @@ class LampHighlights:
 
     def __init__(self, surfaces: LampSurfaces, positions: Single, normals: Single, tangents: Single,
                  albedo: Single) -> None:
-        self._surfaces, self._albedo = surfaces, albedo
+        self._surfaces = surfaces
         self._members = {int(m): np.flatnonzero(surfaces.material == m) for m in surfaces.shiny}
-        self._frames = np.stack([tangents, np.cross(normals, tangents), normals], axis=1).astype(np.float32)
-        self._positions = positions
+        # By axes, each a run of numbers: loops over three numbers at a time cost ten times as much.
+        frames = np.stack([tangents, np.cross(normals, tangents), normals])
+        self._frames = np.ascontiguousarray(frames.transpose(0, 2, 1), np.float32)  # (3, 3, p)
+        self._positions, self._albedo = (np.ascontiguousarray(v.T, np.float32) for v in (positions, albedo))
         self._order = order_of(surfaces.kernels.shape[2])
 
-    def add(self, rows: Single, position: NDArray[np.float64], light: Single) -> None:
-        """Add one lamp's highlight to rows (p, 1 + functions, 3), in place.
+    def write(self, rows: Single, lamps: Sequence[tuple[NDArray[np.float64], Single]]) -> None:
+        """Fill rows 1, 2, ... of rows (p, 1 + functions, 3) zeros, whose row 0 has the sum of all lamps, in place, and
+        dim row 0.
 
-        position: (3,) the lamp's middle; light: (p, 3) its E / pi. A lamp with a surface shines into the highlight
-        from its middle; the bake's functions of the view are far wider than it, as long as it is farther than wide.
+        lamps: of each its middle (3,) and its E / pi (p, 3). A lamp with a surface shines into the highlight from its
+        middle: the functions of the view are far wider than it, as long as it is farther away than it is wide.
         """
-        kernels = self._surfaces.kernels
-        lit = light.any(axis=1)
+        surfaces, lit = self._surfaces, rows[:, 0].any(axis=1)
         for material, members in self._members.items():
-            # (n^2, functions * channels)
-            kernel = np.ascontiguousarray(kernels[material].transpose(1, 0, 2).reshape(kernels.shape[2], -1))
-            for block in _blocks(members[lit[members]]):
-                values = evaluate(self._order, self._directions(block, position)).astype(np.float32)
-                reflected = multiply(values, kernel).reshape(len(block), kernels.shape[1], -1)
-                rows[block, 1:] += reflected * light[block][:, None, :]
-
-    def finish(self, rows: Single) -> None:
-        """Let the layers above dim the diffuse light of row 0, in place, once all lamps are added."""
-        surfaces = self._surfaces
-        for material, members in self._members.items():
-            dimming = surfaces.dimming[material]
-            if dimming.any():
-                for block in _blocks(members):
-                    reflected = self._albedo[block] * rows[block, 0]
-                    rows[block, 1:] += dimming[None, :, None] * reflected[:, None, :]
+            kernel = surfaces.kernels[material]  # (functions, n^2, channels), to (functions * channels, n^2)
+            flat = np.ascontiguousarray(kernel.transpose(0, 2, 1)).reshape(-1, kernel.shape[1])
+            chosen = members[lit[members]]
+            for start in range(0, len(chosen), BLOCK):
+                block = chosen[start:start + BLOCK]
+                reflected = self._albedo[:, block] * rows[block, 0].T
+                total = surfaces.dimming[material][:, None, None] * reflected
+                for position, light in lamps:
+                    self._add(total, block, flat, position, np.ascontiguousarray(light[block].T))
+                rows[block, 1:] = total.transpose(2, 0, 1)
         rows[:, 0] *= surfaces.share[surfaces.material][:, None]
+
+    def _add(self, total: Single, block: NDArray[np.int64], kernel: Single, position: NDArray[np.float64],
+             light: Single) -> None:
+        """Add one lamp's highlight to a block's rows (functions, 3, b). kernel: (functions * channels, n^2); light:
+        (3, b)."""
+        lit = np.flatnonzero(light.any(axis=0))
+        if not len(lit):
+            return
+        whole = len(lit) == len(block)
+        values = evaluate(self._order, self._directions(block if whole else block[lit], position)).astype(np.float32)
+        reflected = multiply(kernel, values.T).reshape(total.shape[0], -1, len(lit))
+        if whole:
+            total += reflected * light
+        else:
+            total[:, :, lit] += reflected * light[:, lit]
 
     def _directions(self, block: NDArray[np.int64], position: NDArray[np.float64]) -> Single:
         """Unit directions (b, 3) to the lamp in the receivers' frames; what lies below the horizon (the middle of a
         lamp whose rim is above) is lifted to it."""
-        towards = (position - self._positions[block]).astype(np.float32)
-        frames = self._frames[block]
-        local = np.stack([np.sum(frames[:, axis] * towards, axis=1) for axis in range(3)], axis=1)
-        local[:, 2] = np.maximum(local[:, 2], 0.0)
-        length = np.sqrt(np.sum(local * local, axis=1, keepdims=True))
-        return np.where(length > 0.0, local / np.maximum(length, np.finfo(np.float32).tiny), np.float32([0, 0, 1]))
-
-
-def _blocks(members: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    for start in range(0, len(members), BLOCK):
-        yield members[start:start + BLOCK]
+        x, y, z = position.astype(np.float32)[:, None] - self._positions[:, block]
+        local = np.stack([f[0] * x + f[1] * y + f[2] * z for f in np.take(self._frames, block, axis=2)])
+        np.maximum(local[2], 0.0, out=local[2])
+        length = np.sqrt(local[0] * local[0] + local[1] * local[1] + local[2] * local[2])
+        local /= np.maximum(length, np.finfo(np.float32).tiny)
+        local[2, length == 0.0] = 1.0  # a lamp in the receiver itself: nothing says where it is
+        return local.T

@@ -119,9 +119,9 @@ class DirectLight:
         if self._highlights is None:
             result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
             return result
-        for lamp in lamps:
-            light = direct_local_light(self._tracer, self._receivers, [lamp], self._samples)
+        found = [(lamp.position, direct_local_light(self._tracer, self._receivers, [lamp], self._samples))
+                 for lamp in lamps]
+        for _, light in found:
             result[:, 0] += light
-            self._highlights.add(result, lamp.position, light)
-        self._highlights.finish(result)
+        self._highlights.write(result, found)
         return result
