@@ -20,7 +20,7 @@ from ..linear_algebra import multiply
 Single = NDArray[np.float32]
 
 # Receivers whose arrays stay in the cache.
-BLOCK = 1024
+BLOCK = 4096
 
 
 @dataclass(frozen=True)
