@@ -232,7 +232,8 @@ def _check_shapes(name: str, baked: BakedTransfer) -> None:
     header = {**baked.header, "shape": [clusters, representatives, rows, columns, channels]}
     container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
                      (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents,
-                     container.flatten_cloud(baked.cloud) if baked.cloud is not None else None)
+                     container.flatten_cloud(baked.cloud) if baked.cloud is not None else None, baked.material,
+                     baked.kernels)
     if baked.weights.shape[1] != representatives - 1:
         raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
 
