@@ -66,8 +66,8 @@ def main() -> None:
     from prt.gpu_shaders import draw, offscreen, render_data
 
     offscreen.prepare_gpu()
-    print(f"{len(baked.cluster)} receivers, {baked.bases.shape[0]} clusters of at most {baked.bases.shape[1] - 1} vectors,"
-          f" {baked.cloud.zones} zones, at most {baked.cloud.columns} lights in each")
+    print(f"{len(baked.cluster)} receivers, {baked.bases.shape[0]} clusters of at most {baked.bases.shape[1] - 1} "
+          f"vectors, {baked.cloud.zones} zones, at most {baked.cloud.columns} lights in each")
     cloud, direct = LampLight(baked.cloud, tracer), DirectLight(tracer, baked)
     transform = np.diag([0.4, 0.4, -0.4, 1.0])
     rows = []

@@ -63,9 +63,9 @@ class Kept:
 class _KeepingBake(_Bake):
     """A bake that keeps its operator."""
 
-    def _local(self, gathered):  # noqa: ANN001, ANN202
+    def _local(self, gathered, visibility):  # noqa: ANN001, ANN202
         self.kept_gather = gathered
-        self.kept_local = yield from super()._local(gathered)
+        self.kept_local = yield from super()._local(gathered, visibility)
         return self.kept_local
 
 

@@ -28,7 +28,6 @@ STAGES = {
     "glossy": "Highlights",
     "local": "Local lights",
     "subsurface": "Light through bodies",
-    "local": "Light of lamps",
     "encode": "Compressing",
     "errors": "Measuring the error",
 }

@@ -166,6 +166,10 @@ ARRAYS = {
     "triangles": "(triangles, 3) int32 into points",
     "tangents": "(points, 3) float32, world space when baked: x of the point's frame, whose y is normal x tangent and "
                 "whose z is the normal; only where rows depend on the view",
+    "material": "(points,) int32 into kernels; only with view-dependent rows and a light cloud",
+    "kernels": "(materials, functions, n^2, 1 or 3) float32: rows 1, 2, ... of a lamp's direct light are kernel . "
+               "y(direction to the lamp in the point's frame) times its E / pi; share and dimming of the diffuse row "
+               "are in the header's lamp_surfaces",
 }
 
 

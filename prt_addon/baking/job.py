@@ -20,9 +20,10 @@ from ..errors import StorageError
 from ..lighting.reference_light import ReferenceLight
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..scene.surface_material import SurfaceMaterial
-from ..storage.container import BakedTransfer, check_header, flatten_cloud, read_cloud
+from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_cloud, read_cloud
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
+from ..storage.lamp_surfaces import read_lamp_surfaces
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
@@ -32,6 +33,7 @@ SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
 _SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents")
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
 _CONTAINER_EXTRA = ("tangents",)  # None where the transfer needs none
+_LAMP_ARRAYS = ("material", "kernels")  # of lamp_surfaces
 
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
@@ -109,6 +111,8 @@ def run_job(folder: Path) -> Generator[Progress]:
               for name in _CONTAINER_ARRAYS + _CONTAINER_EXTRA if getattr(container, name) is not None}
     arrays |= {f"{index}_cloud": flatten_cloud(container.cloud) for index, container in enumerate(
         result.objects.values()) if container.cloud is not None}
+    arrays |= {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
+               for name in _LAMP_ARRAYS if container.lamp_surfaces is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -122,7 +126,9 @@ def read_result(folder: Path) -> BakeResult:
         parts = [arrays[f"{index}_{part}"] for part in _CONTAINER_ARRAYS]
         extra = {part: arrays.get(f"{index}_{part}") for part in _CONTAINER_EXTRA}
         cloud = read_cloud(check_header(header, name), arrays.get(f"{index}_cloud"), name)
-        container = BakedTransfer(header, *parts, **extra, cloud=cloud)
+        lamps = read_lamp_surfaces(header, *(arrays.get(f"{index}_{part}") for part in _LAMP_ARRAYS), len(parts[0]),
+                                   name, REBAKE)
+        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

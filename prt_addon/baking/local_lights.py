@@ -30,6 +30,8 @@ from ..lighting.zones import split_zones
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.gather import Gather
+from ..transport.glossy import GlossySurfaces, reflected_light
+from ..transport.incident_light import DiffuseRadiance, IndirectLight
 from ..transport.local_lights import LightSolver
 from .local_budget import Probes, probe_positions
 from .settings import BakeSettings
@@ -45,14 +47,37 @@ ORDER_OF_SPOTS = 2
 class LocalTransfer:
     """cloud: with every zone's lights; zone: (points,) int32 of the scene's points, 0 where nothing is baked;
     transfer: (points, columns, channels) float32, what reaches a point of the lights of its zone by at least one
-    bounce, for unit albedo, zero beyond the zone's last light; facts: for the report; probes: for the
-    error budget."""
+    bounce, for unit albedo, zero beyond the zone's last light; facts: for the report; points: (g,) of the scene that
+    have highlights; rows: (g, functions, columns, 1 or 3) float32, what these reflect of the surfaces that the lights
+    shine on. None without highlights;
+    probes: for the error budget."""
 
     cloud: LightCloud
     zone: NDArray[np.int32]
     transfer: NDArray[np.float32]
     facts: dict[str, Any]
+    points: NDArray[np.int64] | None = None
+    rows: NDArray[np.float32] | None = None
     probes: Probes | None = None
+
+
+@dataclass(frozen=True)
+class LitHighlights:
+    """The receivers with highlights of a bake with a light cloud.
+
+    points: (g,) of the scene; places: (g,) among the gather's receivers; surfaces: what reflects there; blocked: (g,
+    n^2), see `IndirectLight`.
+    """
+
+    points: NDArray[np.int64]
+    places: NDArray[np.int64]
+    surfaces: GlossySurfaces
+    blocked: NDArray[np.float32]
+
+    def of(self, which: NDArray[np.int64]) -> LitHighlights:
+        """Some of them."""
+        surfaces = replace(self.surfaces, frames=self.surfaces.frames[which], material=self.surfaces.material[which])
+        return LitHighlights(self.points[which], self.places[which], surfaces, self.blocked[which])
 
 
 def fit_to_lamps(settings: BakeSettings, lamps: Sequence[LocalLight]) -> tuple[BakeSettings, tuple[str, ...]]:
@@ -69,12 +94,13 @@ def fit_to_lamps(settings: BakeSettings, lamps: Sequence[LocalLight]) -> tuple[B
 
 def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, albedo: NDArray[np.float32] | None,
                    keys: NDArray[np.int64], regions: NDArray[np.float64], settings: BakeSettings,
-                   folder: Path | None) -> Generator[float, None, LocalTransfer]:
+                   folder: Path | None, highlights: LitHighlights | None = None,
+                   ) -> Generator[float, None, LocalTransfer]:
     """Yield progress, return the transfer.
 
     gathered, albedo (r, channels) of its receivers: None where no light bounces; keys: points whose transfer is kept;
-    regions: (b, 4, 4) boxes of the lights, none for the scene's free space; folder: where large files may lie. Raises
-    BadScene where no light fits.
+    regions: (b, 4, 4) boxes of the lights, none for the scene's free space; folder: where large files may lie;
+    highlights: of receivers whose hits the gather kept. Raises BadScene where no light fits.
     """
     lights = _placed(tracer, scene, regions, settings)
     zones = split_zones(scene.points[keys], settings.zone_receivers or max(1, len(keys)))
@@ -88,14 +114,15 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
     members = [keys[inside] for inside in zones.members()]
     solver = LightSolver(tracer, scene, gathered, albedo, settings.bounce_error, settings.bounces, order,
                          settings.cloud_radius)
+    solved, merging = (SOLVED, MERGED) if highlights is None else (0.5 * SOLVED, 0.5 * MERGED)
     values = order ** 2 * albedo.shape[1]
     with tempfile.TemporaryDirectory(dir=folder, prefix="responses-") as place:
         store = _Responses(Path(place), members, gathered, len(lights), values)
-        yield from _part(solver.solve(lights.positions, store.take), 0.0, SOLVED)
+        yield from _part(solver.solve(lights.positions, store.take), 0.0, solved)
         found = []
         for number in range(len(members)):
             found.append(_merge(tracer, lights, store.of_zone(number), settings, albedo.shape[1]))
-            yield SOLVED + (MERGED - SOLVED) * (number + 1) / len(members)
+            yield solved + (merging - solved) * (number + 1) / len(members)
     cloud = LightCloud.of_zones([positions for positions, _ in found], lights.positions, lights.spacing, order,
                                 settings.cloud_radius)
     transfer = np.zeros((len(scene.points), cloud.columns, albedo.shape[1]), np.float32)
@@ -107,12 +134,21 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
             else:
                 columns = cloud.columns_of(number, light)
                 transfer[members[number], columns] = response.reshape(len(response), order ** 2, -1)
-    yield MERGED
-    yield from _part(_solve_again(solver, cloud, missing, members, gathered, transfer), MERGED, PROBED)
-    probes = None
+    del found
+    yield merging
+    shiny = np.unique(zone[highlights.points]) if highlights is not None else ()
+    plain = [(number, light) for number, light in missing if number not in shiny]
+    middle = PROBED if highlights is None else merging + (PROBED - merging) * len(plain) / max(1, len(missing))
+    yield from _part(_solve_again(solver, cloud, plain, members, gathered, transfer), merging, middle)
+    facts = _facts(lights, cloud, settings)
+    points = rows = probes = None
+    if highlights is not None:
+        points = highlights.points
+        rows = yield from _part(_solve_highlights(solver, cloud, set(missing), zone, members, highlights, transfer),
+                                middle, PROBED)
     if settings.error_receivers:
         probes = yield from _part(_probes(solver, cloud, gathered, len(transfer), settings.seed), PROBED, 1.0)
-    return LocalTransfer(cloud, zone, transfer, _facts(lights, cloud, settings), probes)
+    return LocalTransfer(cloud, zone, transfer, facts, points, rows, probes)
 
 
 def packed_local(local: LocalTransfer) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -122,6 +158,8 @@ def packed_local(local: LocalTransfer) -> tuple[dict[str, NDArray], dict[str, An
               "transfer": local.transfer}
     if local.probes is not None:
         arrays |= {"probe_positions": local.probes.positions, "probe_responses": local.probes.responses}
+    if local.rows is not None:
+        arrays |= {"points": local.points, "rows": local.rows}
     return arrays, {"facts": local.facts, "emission_order": cloud.emission_order, "spacing": cloud.spacing,
                     "radius": cloud.radius}
 
@@ -131,7 +169,8 @@ def unpacked_local(arrays: dict[str, NDArray], header: dict[str, Any]) -> LocalT
     cloud = LightCloud(arrays["positions"], arrays["zone_starts"], header["emission_order"], arrays["dense"],
                        header["spacing"], header["radius"])
     probes = Probes(arrays["probe_positions"], arrays["probe_responses"]) if "probe_positions" in arrays else None
-    return LocalTransfer(cloud, arrays["zone"], arrays["transfer"], header["facts"], probes)
+    return LocalTransfer(cloud, arrays["zone"], arrays["transfer"], header["facts"], arrays.get("points"),
+                         arrays.get("rows"), probes)
 
 
 def _placed(tracer: Tracer, scene: SceneMesh, regions: NDArray[np.float64], settings: BakeSettings) -> PlacedLights:
@@ -194,9 +233,7 @@ def _solve_again(solver: LightSolver, cloud: LightCloud, missing: list[tuple[int
                  members: list[NDArray[np.int64]], gathered: Gather, transfer: NDArray[np.float32],
                  ) -> Generator[float]:
     """New solutions at merged places, written into the transfer of their zones (4.1: "for higher quality")."""
-    row = np.full(len(transfer), -1, np.int64)
-    front = gathered.receivers.key < len(transfer)
-    row[gathered.receivers.key[front]] = np.flatnonzero(front)
+    row = _rows_of_points(gathered, len(transfer))
     functions = cloud.emission_order ** 2
 
     def take(part: slice, response: NDArray[np.float32]) -> None:
@@ -221,6 +258,55 @@ def _probes(solver: LightSolver, cloud: LightCloud, gathered: Gather, points: in
 
     yield from solver.solve(positions, take)
     return Probes(positions, responses)
+
+
+def _rows_of_points(gathered: Gather, points: int) -> NDArray[np.int64]:
+    """(points,) the gather's receiver on the front of each point; -1 without."""
+    row = np.full(points, -1, np.int64)
+    front = gathered.receivers.key < points
+    row[gathered.receivers.key[front]] = np.flatnonzero(front)
+    return row
+
+
+def _solve_highlights(solver: LightSolver, cloud: LightCloud, missing: set[tuple[int, int]], zone: NDArray[np.int32],
+                      members: list[NDArray[np.int64]], highlights: LitHighlights, transfer: NDArray[np.float32],
+                      ) -> Generator[float, None, NDArray[np.float32]]:
+    """Rows (g, functions, columns, channels) of the highlights, zone by zone: a glossy receiver reflects what the
+    lights of its own zone do to all surfaces that it sees, near and far, direct light included.
+
+    Glossy surfaces send to each other as much as they get, but evenly (they are in the solver's albedo). Each zone's
+    lights are solved once more for this, because their field at all receivers is too large to be kept from the first
+    time (receivers x lights x channels); the merged lights of `missing` get their diffuse transfer on the way.
+    """
+    gathered, functions = solver.gathered, cloud.emission_order ** 2
+    row, of_receiver = _rows_of_points(gathered, len(zone)), zone[highlights.points]
+    kernels = highlights.surfaces.kernels
+    channels = max(kernels[0].shape[2], solver.albedo.shape[1])
+    result = np.zeros((len(highlights.points), kernels[0].shape[0], cloud.columns, channels), np.float32)
+    done = 0
+    for number in np.unique(of_receiver):
+        which = np.flatnonzero(of_receiver == number)
+        mine, inside = highlights.of(which), members[number]
+
+        def take(part: slice, response: NDArray[np.float32], number: int = int(number),
+                 inside: NDArray[np.int64] = inside) -> None:
+            for light in range(part.start, part.stop):
+                if (number, light) in missing:
+                    columns = slice((light - part.start) * functions, (light - part.start + 1) * functions)
+                    transfer[inside, cloud.columns_of(number, light)] = response[row[inside], columns]
+
+        def view(part: slice, radiance: NDArray[np.float32], which: NDArray[np.int64] = which,
+                 mine: LitHighlights = mine) -> Generator[float]:
+            source = DiffuseRadiance(gathered.hits, solver.scene, gathered.receivers, radiance)
+            light = IndirectLight(gathered.hits, source, mine.places, mine.blocked)
+            columns = slice(part.start * functions, part.stop * functions)
+            result[which, :, columns] = yield from reflected_light(solver.tracer, mine.surfaces, radiance.shape[1],
+                                                                   light)
+
+        share = len(which) / len(of_receiver)
+        yield from _part(solver.solve(cloud.lights_of(number), take, view), done, done + share)
+        done += share
+    return result
 
 
 def _part(steps: Generator[float, None, Any], first: float, last: float) -> Generator[float, None, Any]:

@@ -26,6 +26,7 @@ from ..compression.groups import encode_groups
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
+from ..linear_algebra import multiply
 from ..reporting.headline import headline
 from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
@@ -34,7 +35,7 @@ from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
 from ..storage.files import intact, save_arrays
 from ..tracing.tracer import Tracer
-from ..transport.buried import buried_receivers, fill_buried
+from ..transport.buried import buried_receivers, fill_buried, past_buried
 from ..transport.direct import direct_transfer
 from ..transport.energy_balance import balanced
 from ..transport.gather import Gather, gather_operator
@@ -47,8 +48,9 @@ from ..transport.receiver_set import ReceiverSet
 from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
+from .lamp_surfaces import with_lamp_surfaces
 from .local_budget import local_budget
-from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
+from .local_lights import LitHighlights, LocalTransfer, local_transfer, packed_local, unpacked_local
 from .plan import Plan, make_plan, most_clusters
 from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
 from .settings import BakeSettings
@@ -56,7 +58,7 @@ from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_wo
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
 POLL_SECONDS = 0.05
-# Shadow rays of a bake for local lights alone, where distant light only checks the scene.
+# Shadow rays of a bake for local lights alone without highlights, where distant light only checks the scene.
 DIRECTIONS_OF_CHECKS = 256
 # Receivers whose layers leave less of the diffuse one than this say nothing about its error.
 LEAST_DIFFUSE = 0.05
@@ -106,8 +108,7 @@ def transport_settings(settings: BakeSettings) -> BakeSettings:
     still tells what is buried, dark, or brighter than it can be."""
     if settings.distant_light:
         return settings
-    return replace(settings, order=1, directions=min(settings.directions, DIRECTIONS_OF_CHECKS), glossy_rows=0,
-                   subsurface=False)
+    return replace(settings, order=1, subsurface=False)
 
 
 @dataclass
@@ -124,6 +125,7 @@ class _Bake:
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
     cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    buried: NDArray[np.int64] | None = None
     local: LocalTransfer | None = None
     local_scale: float = 1.0
     local_sample: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
@@ -148,18 +150,22 @@ class _Bake:
             receivers, transfer, visibility = yield from self._direct(gathered)
         if gathered is not None:
             with self.timer.stage("interreflection"):
-                gathered = balanced(gathered, transfer[:, 0])
+                # Fewer shadow rays than gather rays know less of what a receiver sees than these.
+                if len(self.directions[0]) >= len(self.gather_directions[0]):
+                    gathered = balanced(gathered, transfer[:, 0])
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
         glossy, subsurface = None, []
-        if visibility is not None:
+        if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
                 glossy = yield from self._glossy(receivers, transfer, visibility, gathered)
         local = None
         if self.settings.local_light:
             with self.timer.stage("local"):
-                local = yield from self._local(gathered)
+                yield self._progress("local", 0.0)
+                self._find_buried(self._by_point(receivers, transfer))
+                local = yield from self._local(gathered, visibility)
         # What later stages do not read is large: rays' hits, visibility, the operator.
         gathered, bounced, visibility = _numbers_of(gathered), _numbers_of(bounced), None
         transfer = self._by_point(receivers, transfer)
@@ -168,12 +174,12 @@ class _Bake:
                 subsurface = yield from self._subsurface(transfer)
         with self.timer.stage("encode"):
             yield self._progress("encode", 0.0)
-            buried = self._find_buried(transfer)
+            self._find_buried(transfer)
             signals = self._signals(transfer, glossy, subsurface)
             self._join_local(signals, local)
             self._choose_highlights(glossy, signals)
             glossy = None
-            self._fill_buried(buried, signals)
+            self._fill_buried(signals)
             encodings = yield from self._encode(signals)
         errors: dict[str, Any] = {}
         highlights: dict[str, Any] = {}
@@ -248,11 +254,14 @@ class _Bake:
     def _prepare(self) -> None:
         settings = self.settings
         self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
-        self.directions = quadrature(settings.directions, self.plan.needs.order)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
         self.glossy = self.surfaces.glossy_points(self.scene)
+        directions = settings.directions
+        if not settings.distant_light and not self.glossy.any():
+            directions = min(directions, DIRECTIONS_OF_CHECKS)
+        self.directions = quadrature(directions, self.plan.needs.order)
         self.translucent = self.surfaces.translucent_points(self.scene)
         keep = np.zeros(len(self.scene.points), bool)
         for target in self.targets:
@@ -318,12 +327,7 @@ class _Bake:
         stored = self._load("glossy")
         if stored is not None:
             return GlossyRows(points, stored[0]["rows"])
-        used = np.unique(scene.material[points])
-        kernels = tuple(self.surfaces.parts[number].kernel for number in used)
-        width = max(kernel.shape[2] for kernel in kernels)
-        kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
-        surfaces = GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
-                                  np.searchsorted(used, scene.material[points]), kernels, self.surfaces.functions)
+        surfaces = self._glossy_surfaces(points)
         frames, order = surfaces.frames, self.plan.needs.order
         indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
         first_round = 0.3 if self.glossy_bounce else 1.0
@@ -336,11 +340,22 @@ class _Bake:
             indirect = self._indirect(gathered, receivers, transfer, visibility, albedo, bounce)
             found = yield from self._follow("glossy", glossy_transfer(
                 self.tracer, surfaces, order, visibility.visible, indirect), first_round, 1.0)
-        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]] for number in used], np.float32)
+        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]]
+                            for number in np.unique(scene.material[points])], np.float32)
         if (windows < 1.0).any():
             found *= windows[surfaces.material][:, None, :, None]
         self._save("glossy", {"rows": found})
         return GlossyRows(points, found)
+
+    def _glossy_surfaces(self, points: NDArray[np.int64]) -> GlossySurfaces:
+        """What reflects at these points."""
+        scene = self.scene
+        used = np.unique(scene.material[points])
+        kernels = tuple(self.surfaces.parts[number].kernel for number in used)
+        width = max(kernel.shape[2] for kernel in kernels)
+        kernels = tuple(np.broadcast_to(kernel, (*kernel.shape[:2], width)) for kernel in kernels)
+        return GlossySurfaces(surface_frames(scene.normals[points], scene.tangents[points]),
+                              np.searchsorted(used, scene.material[points]), kernels, self.surfaces.functions)
 
     def _indirect(self, gathered: Gather | None, receivers: ReceiverSet, transfer: NDArray[np.float32],
                   visibility: VisibilityCoefficients, albedo: NDArray[np.float32], bounce: GlossyRadiance | None,
@@ -369,16 +384,23 @@ class _Bake:
         self._save("subsurface", *packed_bodies(bodies))
         return bodies
 
-    def _local(self, gathered: Gather | None) -> Generator[Progress, None, LocalTransfer]:
+    def _local(self, gathered: Gather | None, visibility: VisibilityCoefficients | None,
+               ) -> Generator[Progress, None, LocalTransfer]:
         """The transfer of local lights, by point."""
         stored = self._load("local")
         if stored is not None:
             return unpacked_local(*stored)
-        albedo = None
+        albedo = highlights = None
         if gathered is not None:
+            gathered = replace(gathered, matrix=past_buried(gathered.matrix, gathered.receivers.key, self.scene,
+                                                            self.buried))
             albedo = self.albedo[gathered.receivers.key % len(self.scene.points)][:, :self.plan.needs.channels]
+            if visibility is not None and len(visibility.rows) and gathered.hits is not None:
+                points = gathered.receivers.key[visibility.rows]
+                highlights = LitHighlights(points, visibility.rows, self._glossy_surfaces(points), visibility.blocked)
         local = yield from self._follow("local", local_transfer(
-            self.tracer, self.scene, gathered, albedo, self.keys, self.regions, self.settings, self.folder))
+            self.tracer, self.scene, gathered, albedo, self.keys, self.regions, self.settings, self.folder,
+            highlights))
         self._save("local", *packed_local(local))
         return local
 
@@ -394,20 +416,32 @@ class _Bake:
         if local.probes is not None and len(self.open_keys):
             keys = choose_receivers(self.open_keys, self.settings.error_receivers, self.settings.seed)
             self.local_sample = keys, local.transfer[keys].astype(np.float64)
-        share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
-        distant = sum(float(np.sum(np.square(s, dtype=np.float64))) for s in signals.values())
-        near = float(np.sum(np.square(local.transfer[self.keys], dtype=np.float64)))
-        both = self.settings.distant_light and distant > 0.0 and near > 0.0
-        self.local_scale = np.sqrt(distant / near) if both else 1.0
+        columns, distant, near = 0, 0.0, 0.0
         for target in self.targets:
             before = signals[target.name]
             columns = before.shape[2] if self.settings.distant_light else 0
             joined = np.zeros((*before.shape[:2], columns + local.transfer.shape[1], before.shape[3]), np.float32)
             joined[:, :, :columns] = before[:, :, :columns]
-            dimmed = share[self.scene.material[target.points], None, None] * np.float32(self.local_scale)
-            joined[:, 0, columns:] = local.transfer[target.points] * dimmed
+            self._write_local(joined[:, :, columns:], target, local)
             signals[target.name] = joined
-        self.local = replace(local, transfer=None)
+            metric = row_metric(self.surfaces.functions_of_object(self.scene, target), self.scene.albedo[target.points])
+            distant += _energy(joined[:, :, :columns], metric)
+            near += _energy(joined[:, :, columns:], metric)
+        if distant > 0.0 and near > 0.0:
+            self.local_scale = np.sqrt(distant / near)
+            for signal in signals.values():
+                signal[:, :, columns:] *= np.float32(self.local_scale)
+        self.local = replace(local, transfer=None, rows=None)
+
+    def _write_local(self, signal: NDArray[np.float32], target: SceneObject, local: LocalTransfer) -> None:
+        """A target's light of the cloud (p, rows, columns, channels), into zeros. Bodies are not translucent to it:
+        their subsurface light stays in the diffuse layer (`SurfacePart.lamp_share`)."""
+        share = np.array([part.lamp_share for part in self.surfaces.parts], np.float32)
+        material, diffuse = self.scene.material[target.points], local.transfer[target.points]
+        signal[:, 0] = diffuse * share[material, None, None]
+        if local.rows is not None and signal.shape[1] == 1 + local.rows.shape[1]:
+            GlossyRows(local.points, local.rows).write(signal[:, 1:], target.points)
+            self._add_dimming(signal, material, diffuse, self.scene.albedo[target.points])
 
     def _signals(self, transfer: NDArray[np.float32], glossy: GlossyRows | None,
                  subsurface: list[BodyLight]) -> dict[str, NDArray[np.float32]]:
@@ -466,17 +500,18 @@ class _Bake:
         result[receivers.key[front]] = transfer[front]
         return result
 
-    def _find_buried(self, transfer: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Keys of what lies inside other bodies. It is kept out of the error budget: nobody sees it."""
+    def _find_buried(self, transfer: NDArray[np.float32]) -> None:
+        """What lies inside other bodies, once. It is kept out of the error budget: nobody sees it."""
+        if self.buried is not None:
+            return
         receivers = self.receivers.taken(np.flatnonzero(np.isin(self.receivers.key, self.keys)))
         white = transfer[receivers.key, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
-        buried = buried_receivers(self.tracer, self.scene, receivers, white)
-        self.open_keys = np.setdiff1d(self.keys, buried, assume_unique=True)
-        return buried
+        self.buried = buried_receivers(self.tracer, self.scene, receivers, white)
+        self.open_keys = np.setdiff1d(self.keys, self.buried, assume_unique=True)
 
-    def _fill_buried(self, buried: NDArray[np.int64], signals: dict[str, NDArray[np.float32]]) -> None:
+    def _fill_buried(self, signals: dict[str, NDArray[np.float32]]) -> None:
         """Replace what lies inside other bodies."""
-        self.filled = 0
+        self.filled, buried = 0, self.buried
         for target in self.targets:
             place = target.points
             inside = buried[(buried >= place.start) & (buried < place.stop)] - place.start
@@ -587,7 +622,7 @@ class _Bake:
         if self.local is None or self.local_sample is None or not len(self.local.probes.positions):
             return {}
         settings, (keys, before) = self.settings, self.local_sample
-        share = np.array([part.diffuse_share for part in self.surfaces.parts])[self.scene.material[keys]]
+        share = np.array([part.lamp_share for part in self.surfaces.parts])[self.scene.material[keys]]
         compressed = np.zeros_like(before)
         for target in self.targets:
             inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
@@ -648,6 +683,9 @@ class _Bake:
                                           self.digests.get(target.name, ""), self._local_columns(target.name))
             for target in self.targets
         }
+        if self.local is not None:
+            objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
+                       for target in self.targets}
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:
@@ -666,6 +704,19 @@ class _Bake:
         if self.local is None:
             return None
         return LocalColumns(self.local.cloud, self.cluster_zone[name], self.local_scale)
+
+
+def _energy(signal: NDArray[np.float32], metric: NDArray[np.float64] | None) -> float:
+    """Sum of squares of a signal (p, rows, columns, channels), in the metric of its rows."""
+    total = 0.0
+    for start in range(0, len(signal), ROWS_AT_ONCE):
+        block = signal[start:start + ROWS_AT_ONCE]
+        if metric is None:
+            total += float(np.sum(np.square(block, dtype=np.float64)))
+        else:
+            rows = np.moveaxis(block, 1, 0).reshape(len(metric), -1).astype(np.float64)
+            total += float(np.sum(multiply(metric, rows) * rows))
+    return total
 
 
 @dataclass(frozen=True)

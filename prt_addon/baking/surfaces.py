@@ -26,6 +26,7 @@ from ..transport.brdf import (
     reflection_of_material,
     ringing_window,
 )
+from ..transport.lamp_kernel import lamp_kernel
 from .settings import BakeSettings
 
 # Order of the functions that incident radiance is turned and reflected in, and the smallest eigenvalue of their Gram
@@ -54,7 +55,9 @@ class SurfacePart:
     light that a highlight sharper than the light's order reflects; diffuse_share: of its diffuse
     layer that the layers above leave, a mean over views; dimming: (rows,) how that differs over views; highlight:
     (3,) mean share of the light that its highlight returns; translucent: subsurface light is baked; subsurface_share:
-    of it that leaves, what is no metal and what the highlight lets through.
+    of it that leaves, what is no metal and what the highlight lets through; lamp_kernel: (rows, LAMP_ORDER^2, 1 or 3)
+    for the direct light of lamps, None where kernel is; lamp_share: as diffuse_share, for the light of lamps, which no
+    bake takes through bodies: there the diffuse layer sends back that part, too.
     """
 
     material: SurfaceMaterial
@@ -65,6 +68,8 @@ class SurfacePart:
     highlight: NDArray[np.float64]
     translucent: bool
     subsurface_share: float
+    lamp_kernel: NDArray[np.float64] | None = None
+    lamp_share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +162,9 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
         left_out.append(LeftOut(name, f"it returns {albedo:.1%} of the light, less than glossy_albedo",
                                 "view-dependent rows"))
         return 0
-    choice = choose_rows(material, settings.order, settings.glossy_rows, reflection)
+    # Without distant light the order that limits is that of what receivers see of each other.
+    order = settings.order if settings.distant_light else INCIDENT_ORDER
+    choice = choose_rows(material, order, settings.glossy_rows, reflection)
     if choice.kind == "glossy":
         hints.append(f"{name}: {choice.why}")
         return choice.rows
@@ -188,8 +195,11 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
         hints.append(f"the highlight of material {material.name}: light of order {settings.order} would ring in it; a"
                      f" window leaves {bands[-1]:.0%} of the highest band (glossy_window=false keeps all)")
     window = expand_bands(bands)
+    lamps = lamp_kernel(reflection, functions, settings.glossy_window) if settings.local_light else None
+    if lamps is not None:
+        lamps = lamps[:, :, :kernel.shape[2]]
     return SurfacePart(material, kernel, window, left.mean * through, left.coefficients * through, highlight,
-                       translucent, inside * left.mean)
+                       translucent, inside * left.mean, lamps, left.mean)
 
 
 def row_metric(functions: Indices, albedo: NDArray[np.float32]) -> NDArray[np.float64] | None:

@@ -4,7 +4,8 @@
 The data sits on the object's own mesh where its vertices are the receivers, else on a receiver mesh `PRT <object>`: a
 hidden child of the object. The object points to that mesh, so that appending or linking the object brings the data
 along and renaming anything breaks nothing. Beyond the contract: `prt_albedo` (FLOAT_COLOR), `prt_normal` and, where
-transfer depends on the view, `prt_tangent` (FLOAT_VECTOR, in the object's space), all POINT.
+transfer depends on the view, `prt_tangent` (FLOAT_VECTOR, in the object's space), and where lamps light it, too,
+`prt_material` (INT, places in the property `prt_kernels`), all POINT.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from ..errors import StorageError
 from ..scene.tangents import tangent_frame
 from ..storage import container
 from ..storage.container import BakedTransfer
+from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
 from .fingerprint import fingerprint, geometry_digest, material_digest, used_materials
 from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
@@ -27,7 +29,7 @@ RECEIVER_PROPERTY = "prt_receiver"
 RECEIVER_NAME = "PRT {}"
 MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
 OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE,
-        TANGENT_ATTRIBUTE)
+        TANGENT_ATTRIBUTE, container.MATERIAL_ATTRIBUTE)
 
 
 def write_baked(scene_object: bpy.types.Object, baked: BakedTransfer, digests: dict[str, str | None] | None = None,
@@ -95,7 +97,12 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
         local = _read_attribute(mesh, TANGENT_ATTRIBUTE, 3, scene_object.name)[:, :3]
         tangents = tangent_frame(transform_rows(local, matrix[:3, :3]), geometry[2].astype(np.float64))
     cloud = _read_numbers(mesh, container.CLOUD_PROPERTY) if container.CLOUD_PROPERTY in mesh else None
-    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud)
+    material = kernels = None
+    if LAMP_SURFACES in header:
+        material = _read_attribute(mesh, container.MATERIAL_ATTRIBUTE, 1, scene_object.name)
+        kernels = _read_numbers(mesh, container.KERNELS_PROPERTY) if container.KERNELS_PROPERTY in mesh else None
+    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud, material,
+                            kernels)
 
 
 def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
@@ -225,7 +232,8 @@ def _check_shapes(name: str, baked: BakedTransfer) -> None:
     header = {**baked.header, "shape": [clusters, representatives, rows, columns, channels]}
     container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
                      (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents,
-                     container.flatten_cloud(baked.cloud) if baked.cloud is not None else None)
+                     container.flatten_cloud(baked.cloud) if baked.cloud is not None else None, baked.material,
+                     baked.kernels)
     if baked.weights.shape[1] != representatives - 1:
         raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
 
@@ -260,6 +268,9 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
     mesh[container.BASES_PROPERTY] = np.ascontiguousarray(baked.bases, np.float32).ravel()
     if baked.cloud is not None:
         mesh[container.CLOUD_PROPERTY] = container.flatten_cloud(baked.cloud)
+    if baked.lamp_surfaces is not None:
+        _write_attribute(mesh, container.MATERIAL_ATTRIBUTE, "INT", baked.material)
+        mesh[container.KERNELS_PROPERTY] = np.ascontiguousarray(baked.kernels, np.float32).ravel()
     mesh[container.HEADER_PROPERTY] = json.dumps(header)
 
 
@@ -314,7 +325,8 @@ def _clear_mesh(mesh: bpy.types.Mesh) -> None:
     active, default = mesh.color_attributes.active_color_name, mesh.color_attributes.default_color_name
     for name in [a.name for a in mesh.attributes if a.name.startswith(OURS)]:
         mesh.attributes.remove(mesh.attributes[name])
-    for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY, container.CLOUD_PROPERTY):
+    for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY, container.CLOUD_PROPERTY,
+                container.KERNELS_PROPERTY):
         if key in mesh:
             del mesh[key]
     if active in mesh.color_attributes:

@@ -27,9 +27,7 @@ class Baked(Protocol):
     weights: FloatArray
     bases: FloatArray
     albedo: FloatArray
-    positions: FloatArray
     normals: FloatArray
-    triangles: NDArray[np.int32]
     tangents: FloatArray | None
 
     @property

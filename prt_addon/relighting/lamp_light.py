@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from ..scene.receivers import morton_order
 from ..tracing.tracer import Tracer
 from .direct_light import LitReceivers, direct_local_light
 from .exit_radiance import Baked
+from .lamp_highlights import LampHighlights, LampSurfaces
 
 # Points of a lamp with a surface, at most: its indirect light hardly tells more apart.
 MOST_POINTS = 16
@@ -91,22 +93,42 @@ def _named(names: Sequence[str], chosen: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name, taken in zip(names, chosen, strict=True) if taken))
 
 
+class LitBake(Baked, Protocol):
+    """What direct light reads of storage's BakedTransfer."""
+
+    positions: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    lamp_surfaces: LampSurfaces | None
+
+
 class DirectLight:
     """Direct light of lamps on one bake's receivers.
 
     tracer: of everything that casts shadows.
     """
 
-    def __init__(self, tracer: Tracer, baked: Baked, samples: int = SHADOW_SAMPLES) -> None:
+    def __init__(self, tracer: Tracer, baked: LitBake, samples: int = SHADOW_SAMPLES) -> None:
         self._tracer, self._samples = tracer, samples
         # Neighbours trace alike: up to a quarter faster than in the mesh's order (benchmarks/direct_light.py).
         self._order = morton_order(baked.positions)
         receivers = LitReceivers.of_mesh(tracer, baked.positions, baked.normals, baked.triangles)
         self._receivers = receivers.taken(self._order)
         self._rows = baked.bases.shape[2]
+        surfaces = baked.lamp_surfaces
+        self._highlights = None if surfaces is None else LampHighlights(
+            surfaces, baked.positions, baked.normals, baked.tangents, baked.albedo)
 
     def of(self, lamps: Sequence[LocalLight]) -> NDArray[np.float32]:
         """(points, rows, 3) float32: what they add to the exit radiance, in row 0 for unit albedo."""
         result = np.zeros((len(self._receivers), self._rows, 3), np.float32)
-        result[self._order, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+        if self._highlights is None:
+            result[self._order, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
+            return result
+        found = []
+        for lamp in lamps:
+            light = np.empty((len(result), 3), np.float32)
+            light[self._order] = direct_local_light(self._tracer, self._receivers, [lamp], self._samples)
+            found.append((lamp.position, light))
+            result[:, 0] += light
+        self._highlights.write(result, found)
         return result

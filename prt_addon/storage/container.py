@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from ..errors import StorageError
 from ..lighting.light_cloud import LightCloud
+from ..relighting.lamp_highlights import LampSurfaces
 from .columns import Columns, cloud_part, read_columns
+from .lamp_surfaces import read_lamp_surfaces
 
 SCHEMA = 3  # highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too
 CLUSTER_ATTRIBUTE = "prt_cluster"
@@ -23,6 +25,8 @@ ALBEDO_ATTRIBUTE = "prt_albedo"
 HEADER_PROPERTY = "prt_header"
 BASES_PROPERTY = "prt_bases"
 CLOUD_PROPERTY = "prt_cloud"
+MATERIAL_ATTRIBUTE = "prt_material"
+KERNELS_PROPERTY = "prt_kernels"
 REBAKE = "Bake the object again"
 CONSTANT_ROWS: dict[str, Any] = {"kind": "constant"}
 HEMISPHERE_KIND = "constant_and_hemisphere"
@@ -43,6 +47,7 @@ class BakedTransfer:
     albedo: (p, 3) float32; positions, normals: (p, 3) float32 world space when baked; triangles: (t, 3) int32;
     tangents: (p, 3) float32 likewise, unit, orthogonal to the normals; None where the only row is the diffuse one.
     cloud: the local lights that columns belong to, world space when baked; None where all columns are distant light's.
+    lamp_surfaces: what materials do to the direct light of lamps, where there are a cloud and view-dependent rows.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
     x tangent, y normal x tangent, z normal.
@@ -58,6 +63,17 @@ class BakedTransfer:
     triangles: NDArray[np.int32]
     tangents: NDArray[np.float32] | None = None
     cloud: LightCloud | None = None
+    lamp_surfaces: LampSurfaces | None = None
+
+    @property
+    def material(self) -> NDArray[np.int32] | None:
+        """(p,) int32, the place of each point's material in `kernels`; None without."""
+        return None if self.lamp_surfaces is None else self.lamp_surfaces.material
+
+    @property
+    def kernels(self) -> NDArray[np.float32] | None:
+        """(materials, functions, n^2, 1 or 3) float32: rows 1, 2, ... of a lamp's direct light; None without."""
+        return None if self.lamp_surfaces is None else self.lamp_surfaces.kernels
 
     @property
     def functions(self) -> tuple[int, ...]:
@@ -153,12 +169,13 @@ def pack_weights(weights: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArray], flat_bases: NDArray,
            geometry: tuple[NDArray, NDArray, NDArray, NDArray], subject: str, tangents: NDArray | None = None,
-           flat_cloud: NDArray | None = None) -> BakedTransfer:
+           flat_cloud: NDArray | None = None, material: NDArray | None = None, flat_kernels: NDArray | None = None,
+           ) -> BakedTransfer:
     """The container from stored arrays, checked against the header.
 
     geometry: albedo, positions, normals (p, 3) and triangles (t, 3); tangents (p, 3) where rows need them; flat_cloud:
-    of `flatten_cloud` where columns need it. Raises StorageError where a shape, an index or a value can't be right, so
-    that broken data is never drawn.
+    of `flatten_cloud` where columns need it; material (p,) and flat_kernels where the header has lamp surfaces.
+    Raises StorageError where a shape, an index or a value can't be right, so that broken data is never drawn.
     """
     clusters, representatives, rows, columns, channels = check_header(header, subject)["shape"]
     points, vectors = len(cluster), representatives - 1
@@ -187,7 +204,8 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
                          np.asarray(albedo, np.float32), np.asarray(positions, np.float32),
                          np.asarray(normals, np.float32), np.asarray(triangles, np.int32),
                          None if tangents is None else np.asarray(tangents, np.float32),
-                         read_cloud(header, flat_cloud, subject))
+                         read_cloud(header, flat_cloud, subject),
+                         read_lamp_surfaces(header, material, flat_kernels, points, subject, REBAKE))
 
 
 def flatten_cloud(cloud: LightCloud) -> NDArray[np.float64]:

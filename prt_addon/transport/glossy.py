@@ -103,6 +103,26 @@ def glossy_transfer(tracer: Tracer, surfaces: GlossySurfaces, light_order: int, 
     return out
 
 
+def reflected_light(tracer: Tracer, surfaces: GlossySurfaces, columns: int, indirect: IndirectLight,
+                    ) -> Generator[float, None, NDArray[np.float32]]:
+    """Yield progress, return M (g, rows, columns, channels) float32 of light from surfaces alone, of any columns.
+
+    For the lights of a cloud, whose direct light is no part of a bake. Rows are as they are fitted, whatever
+    `surfaces.functions` says: the bound of `positivity` is for a white world, which no column is here.
+    """
+    channels = max(surfaces.kernels[0].shape[2], indirect.source.values // columns)
+    out = np.empty((len(surfaces), surfaces.kernels[0].shape[0], columns, channels), np.float32)
+    fitted = GlossySurfaces(surfaces.frames, surfaces.material, surfaces.kernels)
+
+    def fill(part: slice) -> None:
+        incident, _ = indirect.transfer(part)
+        _reflect(fitted, part, _to_surface(fitted.frames[part], incident), columns, out[part])
+
+    for part, _ in tracer.map_in_order(fill, indirect.blocks()):
+        yield part.stop / len(surfaces)
+    return out
+
+
 def _blocks(surfaces: GlossySurfaces, columns: int) -> Iterator[slice]:
     """Runs of receivers whose arrays stay bounded."""
     size = max(1, min(BLOCK, NUMBERS // (surfaces.kernels[0].shape[1] * columns)))

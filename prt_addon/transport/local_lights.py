@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,9 @@ from .receiver_set import BLOCK, ReceiverSet
 Single = NDArray[np.float32]
 # What takes the lights of a slice and their responses (r, lights * functions, channels), in the receivers' order.
 Consumer = Callable[[slice, Single], None]
+# What takes the lights of a slice and what all surfaces send back of them (r, lights * functions, channels), yielding
+# progress.
+Viewer = Callable[[slice, Single], Generator[float]]
 
 # Columns carried through the operator at once: 256 of 50,000 receivers and three channels are 154 MB. The more there
 # are, the more of what they do after their first bounce is alike.
@@ -110,20 +114,33 @@ class LightSolver:
     emission_order: int = 1
     radius: float = 0.0
 
-    def solve(self, positions: NDArray[np.float64], take: Consumer) -> Generator[float]:
-        """Yield progress; give the indirect responses to lights at positions (l, 3) to `take`, block by block."""
+    def solve(self, positions: NDArray[np.float64], take: Consumer, view: Viewer | None = None) -> Generator[float]:
+        """Yield progress; give the indirect responses to lights at positions (l, 3) to `take`, block by block.
+
+        view: gets the radiance that leaves all surfaces, direct light's part included: the first bounce of whoever
+        sees them. (The direct light is the operator's source, whose flux is right on coarse triangles, too.)
+        """
         functions = self.emission_order ** 2
         size = max(1, COLUMNS // functions)
-        near = NearTriangles(self.tracer, self.scene, self.gathered.receivers)
         for start in range(0, len(positions), size):
             part = slice(start, min(start + size, len(positions)))
             share = (part.stop - start) / max(1, len(positions))
             first = start / max(1, len(positions))
+            half = (0.5 if view is None else 0.3) * share
             direct = yield from _scaled(unit_light_direct(self.tracer, self.gathered.receivers, positions[part],
-                                                          self.emission_order, self.radius), first, 0.5 * share)
-            self._conserve_flux(near, direct, positions[part])
-            yield first + 0.5 * share
-            take(part, (yield from _scaled(self._bounced(direct), first + 0.5 * share, 0.5 * share)))
+                                                          self.emission_order, self.radius), first, half)
+            self._conserve_flux(self._near, direct, positions[part])
+            yield first + half
+            response = yield from _scaled(self._bounced(direct), first + half, half)
+            take(part, response)
+            if view is not None:
+                response += direct[:, :, None]
+                response *= self.albedo[:, None, :]
+                yield from _scaled(view(part, response), first + 2.0 * half, share - 2.0 * half)
+
+    @cached_property
+    def _near(self) -> NearTriangles:
+        return NearTriangles(self.tracer, self.scene, self.gathered.receivers)
 
     def _conserve_flux(self, near: NearTriangles, direct: Single, positions: NDArray[np.float64]) -> None:
         """Make the direct field (r, lights * functions), in place, the operator's source: see `NearTriangles`."""

@@ -326,10 +326,12 @@ def test_threads_blocks_and_the_order_of_receivers_change_nothing():
 def test_the_preview_gets_its_receivers_order_and_rows():
     scene = sphere(subdivisions=3)
     tracer = tracer_of(scene, FLOOR)
-    baked = SimpleNamespace(positions=scene.positions, normals=scene.positions, bases=np.zeros((1, 2, 4, 9, 1)))
+    baked = SimpleNamespace(positions=scene.positions, normals=scene.positions, bases=np.zeros((1, 2, 4, 9, 1)),
+                            triangles=scene.triangles, lamp_surfaces=None)
     lights = [lamp("point", (1.0, 2.0, 3.0)), lamp("point", (-2.0, 0, 1), radius=0.2)]
     found = DirectLight(tracer, baked, samples=8).of(lights)
-    plain = direct_local_light(tracer, LitReceivers.of_points(tracer, scene.positions, scene.positions), lights, 8)
+    receivers = LitReceivers.of_mesh(tracer, scene.positions, scene.positions, scene.triangles)
+    plain = direct_local_light(tracer, receivers, lights, 8)
     assert found.shape == (len(scene.positions), 4, 3)
     np.testing.assert_allclose(found[:, 0], plain, rtol=1e-6)
     assert not found[:, 1:].any()
