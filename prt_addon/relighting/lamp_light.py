@@ -119,7 +119,7 @@ class DirectLight:
         if self._highlights is None:
             result[:, 0] = direct_local_light(self._tracer, self._receivers, lamps, self._samples)
             return result
-        found = [(lamp.position, direct_local_light(self._tracer, self._receivers, [lamp], self._samples))
+        found = [(lamp, direct_local_light(self._tracer, self._receivers, [lamp], self._samples))
                  for lamp in lamps]
         for _, light in found:
             result[:, 0] += light
