@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..lighting.light_cloud import LightCloud
 from ..lighting.light_interpolation import CloudInterpolator
 from ..lighting.light_visibility import surroundings
+from ..linear_algebra import batched_multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.path_reference import PointLights, reference_radiance
@@ -70,8 +71,8 @@ def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
     weights = CloudInterpolator(cloud, tracer).weights(probes.positions).weights  # (places, zones, lights)
     own = weights[:, zone[place]].transpose(1, 0, 2)  # (k, places, lights)
     step = cloud.emission_order ** 2
-    interpolated, drawn = (np.broadcast_to(np.einsum("kpl,klc->kpc", own, values[place][:, ::step][:, :own.shape[2]]),
-                                           shape) for values in (transfer, compressed))  # small
+    interpolated, drawn = (np.broadcast_to(batched_multiply(own, np.ascontiguousarray(
+        values[place][:, ::step][:, :own.shape[2]])), shape) for values in (transfer, compressed))
     first, second = truth
     # Every place counts alike, whether it is near to a surface, where all is brighter, or far.
     power = first * second

@@ -128,7 +128,7 @@ class DirectLight:
         for lamp in lamps:
             light = np.empty((len(result), 3), np.float32)
             light[self._order] = direct_local_light(self._tracer, self._receivers, [lamp], self._samples)
-            found.append((lamp.position, light))
+            found.append((lamp, light))
             result[:, 0] += light
         self._highlights.write(result, found)
         return result

@@ -187,6 +187,16 @@ def test_zones_see_their_own_lights():
     assert (merged.kept.transfer[merged.kept.points[mine]][:, :lights] > 0.0).any(axis=(0, 2)).all()
 
 
+def test_directed_emission_has_the_isotropic_part_first():
+    plain = until_encoding(room_with_ball(4), cloud_lights=2, gather_directions=64, directions=256, cloud_emission=1)
+    directed = until_encoding(room_with_ball(4), cloud_lights=2, gather_directions=64, directions=256, cloud_emission=2)
+    assert directed.kept.rows.shape[2] == 4 * plain.kept.rows.shape[2]
+    largest = np.abs(plain.kept.rows).max()
+    # The series of bounces stops at bounce_error of the energy of all columns together.
+    np.testing.assert_allclose(directed.kept.rows[:, :, ::4], plain.kept.rows, atol=1e-3 * largest)
+    assert all(np.abs(directed.kept.rows[:, :, k::4]).max() > 0.01 * largest for k in (1, 2, 3))
+
+
 def test_a_bake_ends_with_both_kinds_of_rows_and_a_joined_one_too():
     scene = room_with_ball(4)
     wanted = {"spacing": "0", "threads": "1", "gather_directions": "128", "directions": "256", "cloud_lights": "8",
@@ -306,7 +316,8 @@ def test_direct_rows_against_ggx(kind):
     lamp = lamp_at((0.4, 0.6, 2.5), radius=0.2 if kind == "wide" else 0.0)
     tracer = Tracer(scene.points, scene.triangles, 1)
     rows = DirectLight(tracer, ball).of([lamp])
-    light = direct_local_light(tracer, LitReceivers.of_points(tracer, ball.positions, ball.normals), [lamp])
+    receivers = LitReceivers.of_mesh(tracer, ball.positions, ball.normals, ball.triangles)
+    light = direct_local_light(tracer, receivers, [lamp])
     np.testing.assert_allclose(rows[:, 0], 0.75 * light, rtol=1e-6)
     assert 0.1 < (light[:, 0] > 0.0).mean() < 0.6
     dimmed = ball.lamp_surfaces.dimming[0][None, :, None] * (0.5 * light)[:, None, :]
@@ -326,6 +337,38 @@ def test_direct_rows_against_ggx(kind):
         weight = of_view[:, None] * views[:, 2:]
         error = np.sqrt(np.sum((found - expected) ** 2 * weight) / np.sum(expected ** 2 * weight))
         assert error < 0.05
+
+
+@pytest.mark.parametrize("size", [0.3, 1.5])
+def test_a_near_area_light_shines_from_all_of_its_face(size):
+    """A square 1 m above a metal floor, against many small lamps in its place; 30 degree turned, so that the floor sees
+    it from the side, too."""
+    functions = hemisphere.functions_of(16)
+    floor = plane(size=4.0, cells=40)
+    kernel = lamp_kernel(reflection_of_material(replace(METAL, roughness=0.4), INCIDENT_ORDER), functions)
+    count = len(floor.positions)
+    surfaces = LampSurfaces(np.zeros(count, np.int32), kernel[None].astype(np.float32), np.ones(1, np.float32),
+                            np.zeros((1, 16), np.float32))
+    up, along = np.tile(np.float32([0, 0, 1]), (count, 1)), np.tile(np.float32([1, 0, 0]), (count, 1))
+    ball = Ball(surfaces, floor.positions.astype(np.float32), up, along, np.zeros((count, 3), np.float32),
+                np.zeros((1, 1, 17, 1, 1)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[np.cos(0.5), 0, np.sin(0.5)], [0, 1, 0], [-np.sin(0.5), 0, np.cos(0.5)]]
+    matrix[:3, 3] = (0, 0, 1.0)
+    whole = LocalLight("area", "area", matrix, np.full(3, 10.0), size=(size, size))
+    scene = SceneMesh.assemble([floor])
+    direct = DirectLight(Tracer(scene.points, scene.triangles, 1), ball)
+    found = direct.of([whole])
+    parts, line = [], ((np.arange(12) + 0.5) / 12 - 0.5) * size
+    for x in line:
+        for y in line:
+            moved = matrix.copy()
+            moved[:3, 3] += matrix[:3, :3] @ (x, y, 0)
+            parts.append(LocalLight("part", "area", moved, np.full(3, 10.0 / 144), size=(1e-3, 1e-3)))
+    expected = direct.of(parts)
+    root = np.linalg.cholesky(hemisphere.gram_matrix(functions)).T
+    error, size_of = (np.sqrt(np.mean((root @ rows[:, 1:, 0].T) ** 2)) for rows in (found - expected, expected))
+    assert error < 0.06 * size_of
 
 
 def test_two_lamps_add_up_and_a_broken_store_is_refused():
