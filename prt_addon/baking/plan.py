@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh
+from ..transport.interreflection import SLOW_RATIO
 from ..transport.receiver_set import BLOCK
 from .settings import BakeSettings
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
@@ -24,17 +25,18 @@ SECONDS_PER_GLOSSY_VALUE = 1e-7
 SECONDS_PER_LOCAL_VALUE = 2e-7
 SECONDS_PER_SUBSURFACE_VALUE = 2e-6
 # Memory, fitted to the peaks of stages of bakes of 3,000 to 41,000 receivers, diffuse and metal, draft to high: it is
-# 1.2 to 1.6 times what they took, most of it for PROCESS, the interpreter and its libraries, which are larger in Blender.
+# 1.2 to 1.8 times what they took; PROCESS, the interpreter and its libraries, is half of that here, more in Blender.
 PROCESS_BYTES, BYTES_PER_TRIANGLE = 200e6, 150
 # Of the operator, per hit of a gather ray: three entries; what glossy receivers remember of a hit; and lists of one
 # block while they are sorted into the operator.
 BYTES_PER_RAY_HIT, BYTES_PER_KEPT_HIT, BYTES_PER_SORTED_HIT = 24, 30, 75
-# The bounces' copies of the transfer; of bases, in double precision twice and in single once.
-COPIES_OF_BOUNCES, BYTES_PER_BASE_VALUE = 5, 20
+# The bounces' copies of the transfer in single precision, those of the Krylov solver in double (as twice as many), and
+# copies of the operator besides its own then; of bases, in double precision twice and in single once.
+COPIES_OF_SERIES, COPIES_OF_KRYLOV, BYTES_PER_BASE_VALUE = 5, 24, 20
 # The encoder's rows at once, how often they are held, and the most axes that it looks for (see global_frame.py).
 ENCODED_ROWS, COPIES_OF_ROWS, MOST_AXES = 4096, 4, 1024
-# Local lights: solved at once, copies of these while light bounces; and the share that is left of them after merging.
-LIGHTS_AT_ONCE, COPIES_OF_SOLUTIONS, TYPICAL_MERGED_SHARE = 32, 8, 0.5
+# Local lights: solved at once, and the share that is left of them after merging.
+LIGHTS_AT_ONCE, TYPICAL_MERGED_SHARE = 32, 0.5
 # Smaller clusters cost more in bases, and in constants at each light change, than their points save.
 RECEIVERS_PER_CLUSTER = 24
 # Of matrices (highlights): receivers for each one in a basis, so that what is stored shrinks to half at most, and bytes
@@ -135,8 +137,11 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
     rows = 4 * glossy * len(surfaces.functions) * needs.order ** 2 * needs.channels
     visibility = 4 * glossy * ((INCIDENT_ORDER + needs.order - 1) ** 2 + INCIDENT_ORDER ** 2)
     known = operator + kept + visibility
+    # A series of bounces is slow only where surfaces send back more than its ratio.
+    slow = float(surfaces.bounce_albedo(scene).max(initial=0.0)) > SLOW_RATIO
+    copies, second = (COPIES_OF_KRYLOV, 1.5 * operator) if slow else (COPIES_OF_SERIES, 0.5 * operator)
     stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
-              known + operator / 2 + COPIES_OF_BOUNCES * transfer,
+              known + second + copies * transfer,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
               _encoding(settings, _shapes(scene, settings, needs, surfaces), rows, transfer)]
     responses = merged = 0
@@ -146,8 +151,8 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
         merged = 4 * receivers * _local_columns(settings) * needs.channels
         zone = responses * min(1.0, (settings.zone_receivers or receivers) / max(1, receivers))
         at_once = min(LIGHTS_AT_ONCE, settings.cloud_lights)
-        stages.append(known + transfer + rows + merged
-                      + max(2 * zone, COPIES_OF_SOLUTIONS * 4 * receivers * at_once * emitted))
+        solving = second + copies * 4 * receivers * at_once * emitted if needs.bounces else 0.0
+        stages.append(known + transfer + rows + merged + max(2 * zone, solving))
     disk = operator + kept + visibility + 2 * transfer + rows + merged + responses
     return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + max(stages)), int(disk)
 
