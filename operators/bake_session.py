@@ -80,14 +80,15 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
         "rays": sum(plan.rays.values()),
         "peak_bytes": plan.peak_bytes,
         "stored_bytes": plan.stored_bytes,
+        "disk_bytes": plan.disk_bytes,
     }
 
 
 def analysis_lines(analysis: dict[str, Any]) -> list[str]:
     """An analysis in a few lines for the panel."""
-    lines = [f"About {analysis['seconds']:.0f} s, {analysis['peak_bytes'] / 1e6:.0f} MB while baking, "
-             f"{analysis['stored_bytes'] / 1e6:.1f} MB stored, for "
-             f"{plural(analysis['receivers'], 'receiver', 'receivers')}"]
+    lines = [f"About {analysis['seconds']:.0f} s for {plural(analysis['receivers'], 'receiver', 'receivers')}, "
+             f"{analysis['peak_bytes'] / 1e6:.0f} MB of memory and {analysis['disk_bytes'] / 1e6:.0f} MB of disk while "
+             f"baking, {analysis['stored_bytes'] / 1e6:.1f} MB stored"]
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
     return lines + analysis["hints"] + analysis["warnings"]
 

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh
+from ..transport.interreflection import SLOW_RATIO
+from ..transport.receiver_set import BLOCK
 from .settings import BakeSettings
-from .surfaces import SurfacePlan, plan_surfaces
+from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
 # Orders of magnitude measured on two cores (benchmarks/tracing.py); used for the forecast and the progress bar only,
 # which corrects itself by the time that stages really took.
@@ -21,7 +24,19 @@ SECONDS_PER_ENCODED_VALUE = 1.2e-8
 SECONDS_PER_GLOSSY_VALUE = 1e-7
 SECONDS_PER_LOCAL_VALUE = 2e-7
 SECONDS_PER_SUBSURFACE_VALUE = 2e-6
-BYTES_PER_RAY_HIT = 24
+# Memory, fitted to the peaks of stages of bakes of 3,000 to 41,000 receivers, diffuse and metal, draft to high: it is
+# 1.2 to 1.8 times what they took; PROCESS, the interpreter and its libraries, is half of that here, more in Blender.
+PROCESS_BYTES, BYTES_PER_TRIANGLE = 200e6, 150
+# Of the operator, per hit of a gather ray: three entries; what glossy receivers remember of a hit; and lists of one
+# block while they are sorted into the operator.
+BYTES_PER_RAY_HIT, BYTES_PER_KEPT_HIT, BYTES_PER_SORTED_HIT = 24, 30, 75
+# The bounces' copies of the transfer in single precision, those of the Krylov solver in double (as twice as many), and
+# copies of the operator besides its own then; of bases, in double precision twice and in single once.
+COPIES_OF_SERIES, COPIES_OF_KRYLOV, BYTES_PER_BASE_VALUE = 5, 24, 20
+# The encoder's rows at once, how often they are held, and the most axes that it looks for (see global_frame.py).
+ENCODED_ROWS, COPIES_OF_ROWS, MOST_AXES = 4096, 4, 1024
+# Local lights: solved at once, and the share that is left of them after merging.
+LIGHTS_AT_ONCE, TYPICAL_MERGED_SHARE = 32, 0.5
 # Smaller clusters cost more in bases, and in constants at each light change, than their points save.
 RECEIVERS_PER_CLUSTER = 24
 # Of matrices (highlights): receivers for each one in a basis, so that what is stored shrinks to half at most, and bytes
@@ -34,7 +49,8 @@ TYPICAL_HIT_SHARE = 0.5
 @dataclass(frozen=True)
 class Plan:
     """needs: what the scene needs; surfaces: what its materials get; receivers: baked; seconds: expected for each stage
-    that will run; rays: expected for each; peak_bytes, stored_bytes: expected."""
+    that will run; rays: expected for each; peak_bytes, stored_bytes: expected; disk_bytes: of finished stages and of
+    local lights' responses, while baking."""
 
     needs: Needs
     surfaces: SurfacePlan
@@ -43,6 +59,7 @@ class Plan:
     rays: dict[str, int]
     peak_bytes: int
     stored_bytes: int
+    disk_bytes: int
 
 
 def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None) -> Plan:
@@ -81,12 +98,76 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     if settings.error_receivers:
         rays["errors"] = 2 * settings.error_receivers * settings.error_paths
         seconds["errors"] = 0.1 + rays["errors"] / PATH_RAYS_PER_SECOND
-    operator = gather * TYPICAL_HIT_SHARE * BYTES_PER_RAY_HIT if needs.bounces else 0
-    stored = receivers * 4 * (1 + 4 * -(-settings.vectors // 4) + 4) + 4 * settings.clusters * (
-        settings.vectors + 1) * columns * needs.channels * (1 + (len(surfaces.functions) if glossy else 0))
-    peak = int(2e8 + 150 * len(scene.triangles) + operator + 4 * 4 * values)
-    return Plan(needs, surfaces, receivers, seconds, rays, peak, int(stored))
+    peak, disk = _memory(scene, settings, needs, surfaces, receivers)
+    return Plan(needs, surfaces, receivers, seconds, rays, peak, _stored(scene, settings, needs, surfaces), disk)
 
+
+def _local_columns(settings: BakeSettings, share: float = TYPICAL_MERGED_SHARE) -> int:
+    """Columns of local lights, if a share of them is left after merging."""
+    if not settings.local_light:
+        return 0
+    kept = 1.0 if settings.merge_response == 0.0 or settings.merge_distance == 0.0 else share
+    return math.ceil(kept * settings.cloud_lights) * max(1, settings.cloud_emission) ** 2
+
+
+def _shapes(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan,
+            ) -> list[tuple[int, tuple[int, int, int]]]:
+    """Of each target, its receivers and the shape of their matrices (rows, columns, channels)."""
+    columns = (needs.order ** 2 if settings.distant_light else 0) + _local_columns(settings)
+    return [(int((~scene.loose[o.points]).sum()),
+             (1 + len(surfaces.functions_of_object(scene, o)), columns, needs.channels))
+            for o in scene.objects if o.is_target]
+
+
+def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan) -> int:
+    """Bytes in the .blend file: cluster, weights and colour of each receiver, and the bases."""
+    per_receiver = 4 * (1 + 4 * -(-settings.vectors // 4) + 4)
+    return sum(count * per_receiver
+               + 4 * most_clusters(settings, count, shape) * (settings.vectors + 1) * math.prod(shape)
+               for count, shape in _shapes(scene, settings, needs, surfaces))
+
+
+def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan, receivers: int,
+            ) -> tuple[int, int]:
+    """Bytes at the peak of the largest stage, and on disk at the end of the last one."""
+    glossy = int(surfaces.glossy_points(scene).sum())
+    hits_each = settings.gather_directions / 2 * TYPICAL_HIT_SHARE if needs.bounces else 0.0
+    operator, kept = receivers * hits_each * BYTES_PER_RAY_HIT, glossy * hits_each * BYTES_PER_KEPT_HIT
+    transfer = 4 * receivers * needs.order ** 2 * needs.channels
+    rows = 4 * glossy * len(surfaces.functions) * needs.order ** 2 * needs.channels
+    visibility = 4 * glossy * ((INCIDENT_ORDER + needs.order - 1) ** 2 + INCIDENT_ORDER ** 2)
+    known = operator + kept + visibility
+    # A series of bounces is slow only where surfaces send back more than its ratio.
+    slow = float(surfaces.bounce_albedo(scene).max(initial=0.0)) > SLOW_RATIO
+    copies, second = (COPIES_OF_KRYLOV, 1.5 * operator) if slow else (COPIES_OF_SERIES, 0.5 * operator)
+    stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
+              known + second + copies * transfer,
+              known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
+              _encoding(settings, _shapes(scene, settings, needs, surfaces), rows, transfer)]
+    responses = merged = 0
+    if settings.local_light:
+        emitted = max(1, settings.cloud_emission) ** 2 * needs.channels
+        responses = 4 * receivers * settings.cloud_lights * emitted if needs.bounces else 0
+        merged = 4 * receivers * _local_columns(settings) * needs.channels
+        zone = responses * min(1.0, (settings.zone_receivers or receivers) / max(1, receivers))
+        at_once = min(LIGHTS_AT_ONCE, settings.cloud_lights)
+        solving = second + copies * 4 * receivers * at_once * emitted if needs.bounces else 0.0
+        stages.append(known + transfer + rows + merged + max(2 * zone, solving))
+    disk = operator + kept + visibility + 2 * transfer + rows + merged + responses
+    return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + max(stages)), int(disk)
+
+
+def _encoding(settings: BakeSettings, shapes: list[tuple[int, tuple[int, int, int]]], rows: int,
+              transfer: int) -> float:
+    """Bytes while signals are made and encoded, object by object."""
+    signals = sum(4 * count * math.prod(shape) for count, shape in shapes)
+    largest = 0.0
+    for count, shape in shapes:
+        values = math.prod(shape)
+        bases = most_clusters(settings, count, shape) * (settings.vectors + 1) * values * BYTES_PER_BASE_VALUE
+        turned = 4 * count * min(values, MOST_AXES) + 4 * COPIES_OF_ROWS * min(count, ENCODED_ROWS) * values
+        largest = max(largest, 4 * count * values + turned + bases)
+    return transfer + signals + max(rows, largest)
 
 
 def most_clusters(settings: BakeSettings, receivers: int, shape: tuple[int, int, int]) -> int:

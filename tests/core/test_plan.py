@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Forecasts of a bake against what it takes: memory in a process of its own, bytes stored, bytes on disk."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from prt_addon.baking.plan import PROCESS_BYTES, make_plan
+from prt_addon.baking.recipe import bake, exhaust
+from prt_addon.baking.settings import make_settings
+from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.scene.surface_material import SurfaceMaterial
+from tests.core.shapes import plane, sphere
+
+ROOT = Path(__file__).parents[2]
+QUICK = {"spacing": "0", "error_receivers": "0", "threads": "1", "directions": "128", "gather_directions": "64"}
+
+
+def still_life(kind, subdivisions=4):
+    """A ball over a floor: grey, or the ball of gold."""
+    ball, floor = sphere(centre=(0, 0, 0.9), radius=0.8, subdivisions=subdivisions), plane(size=4.0, cells=20)
+    if kind == "metal":
+        gold = SurfaceMaterial(metallic=1.0, roughness=0.4, base_colour=(0.9, 0.7, 0.3))
+        ball = replace(ball, corner_albedo=np.zeros_like(ball.corner_albedo), materials=(gold,),
+                       material_index=np.zeros(len(ball.triangles), np.int32))
+    return SceneMesh.assemble([floor, ball])
+
+
+CHILD = """
+import json, resource, sys
+from tests.core.test_plan import QUICK, bake, exhaust, make_plan, make_settings, still_life
+kind, preset, subdivisions = sys.argv[1:]
+scene = still_life(kind, int(subdivisions))
+settings = make_settings(preset, {**QUICK, "encoder": "static"})
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+stages = exhaust(bake(scene, settings)).report["stages"]
+# A stage starts a new peak where the system can, so that the process' own is the last stage's.
+peak = max([stage["peak_bytes"] for stage in stages] + [1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss])
+print(json.dumps([1024 * before, peak, make_plan(scene, settings, None).peak_bytes]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory otherwise")
+@pytest.mark.parametrize(("kind", "preset", "subdivisions"), [
+    ("grey", "standard", 5), ("metal", "high", 4)])
+def test_memory_is_about_as_foretold(kind, preset, subdivisions):
+    done = subprocess.run([sys.executable, "-c", CHILD, kind, preset, str(subdivisions)], cwd=ROOT, check=True,
+                          capture_output=True, text=True, timeout=100)
+    before, peak, foretold = json.loads(done.stdout)
+    assert peak < foretold < 2.0 * (peak - before + PROCESS_BYTES)
+
+
+def test_stored_bytes_are_about_as_foretold():
+    scene, settings = still_life("metal"), make_settings("draft", QUICK)
+    plan = make_plan(scene, settings, None)
+    result = exhaust(bake(scene, settings))
+    stored = sum(getattr(o, name).nbytes for o in result.objects.values()
+                 for name in ("bases", "weights", "cluster", "albedo"))
+    assert stored < plan.stored_bytes < 3.0 * stored
+
+
+def test_local_lights_count():
+    """As columns in what is stored, as responses on disk, and in memory; merging makes them fewer."""
+    scene = still_life("grey")
+    distant, local, both, all_kept = (make_plan(scene, make_settings("standard", {**QUICK, **more}), None) for more in (
+        {}, {"lighting": "local"}, {"lighting": "environment,local"},
+        {"lighting": "environment,local", "merge_response": "0"}))
+    assert distant.stored_bytes < both.stored_bytes < all_kept.stored_bytes and local.stored_bytes < both.stored_bytes
+    responses = 4 * both.receivers * 216 * both.needs.channels
+    assert both.disk_bytes > distant.disk_bytes + responses and both.peak_bytes > distant.peak_bytes
+    directed = make_plan(scene, make_settings("standard", {**QUICK, "lighting": "local", "cloud_emission": "3"}), None)
+    assert directed.disk_bytes > 8 * responses
