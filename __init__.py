@@ -11,7 +11,7 @@ from .operators.bake import PRT_OT_bake, PRT_OT_cancel
 from .operators.clear import PRT_OT_clear
 from .operators.job_mixin import JobMixin
 from .operators.preview import PRT_OT_toggle_preview
-from .panels.sidebar import PRT_PT_bake, PRT_PT_preview, PRT_PT_results
+from .panels.sidebar import PRT_PT_bake, PRT_PT_expert, PRT_PT_preview, PRT_PT_results
 
 CLASSES = (
     properties.PRTSettings,
@@ -23,6 +23,7 @@ CLASSES = (
     PRT_OT_clear,
     PRT_OT_toggle_preview,
     PRT_PT_bake,
+    PRT_PT_expert,
     PRT_PT_preview,
     PRT_PT_results,
 )

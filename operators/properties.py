@@ -24,9 +24,26 @@ PRESET_ITEMS = (
 )
 
 
+# Most functions of the view direction. The numbers are the settings' own, so a file keeps them whatever is added here.
+ROW_ITEMS = (
+    ("0", "None", "Diffuse light only: metals are drawn black. Costs nothing", 0),
+    ("4", "4", "A broad sheen. Costs four times the diffuse data and bake time", 4),
+    ("9", "9", "Soft highlights, for rough materials. Costs nine times the diffuse data", 9),
+    ("16", "16", "Highlights of roughness 0.5 and above. Costs sixteen times the diffuse data", 16),
+    ("24", "24", "Highlights of roughness 0.3 and above. Costs twenty-four times the diffuse data", 24),
+    ("25", "25", "As 24 with one function more, which hardly shows", 25),
+)
+# Settings of the expert panel that are a bake setting of the same name.
+EXPERT = ("glossy_rows", "glossy_albedo", "glossy_window", "subsurface", "coherence")
+
+
 def _take_preset(settings: PRTSettings, _context: bpy.types.Context) -> None:
     """Choosing a preset fills in the numbers below it."""
-    settings.order = PRESETS[settings.preset].order
+    preset = PRESETS[settings.preset]
+    settings.order = preset.order
+    for name in EXPERT:
+        value = getattr(preset, name)
+        setattr(settings, name, str(value) if name == "glossy_rows" else value)
 
 
 def _redraw(_settings: PRTSettings, _context: bpy.types.Context) -> None:
@@ -58,6 +75,34 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Light from surface to surface: colours bleed, corners brighten. Costs about as long again as "
                     "the shadows",
     )
+    glossy_rows: EnumProperty(
+        name="Highlight Detail", items=ROW_ITEMS, default=str(PRESETS["standard"].glossy_rows),
+        description="Most functions of the view direction that a highlight gets. More buys sharper reflections; each "
+                    "costs as much data and work as the whole diffuse light. Materials that need fewer get fewer",
+    )
+    glossy_albedo: FloatProperty(
+        name="Least Highlight", min=0.0, max=1.0, default=PRESETS["standard"].glossy_albedo, step=1, precision=2,
+        subtype="FACTOR",
+        description="Share of the light that a highlight must return to be baked (a plastic returns 0.05 to 0.09, a "
+                    "metal most). Lower buys the sheen of plastics, at the cost of all their rows; below it the light "
+                    "stays in the diffuse layer",
+    )
+    glossy_window: BoolProperty(
+        name="Soften Highlights", default=True,
+        description="Highlights sharper than the order reflect a softer light. Buys highlights without dark rings, "
+                    "costs some of their sharpness, and nothing where nothing rings",
+    )
+    subsurface: BoolProperty(
+        name="Light Through Bodies", default=True,
+        description="Light travels inside translucent materials (subsurface weight). Buys wax, skin and marble that "
+                    "glow; costs its own stage of the bake and three colour channels. Off: they are opaque",
+    )
+    coherence: FloatProperty(
+        name="Coherence", min=0.0, max=0.5, default=0.0, soft_max=0.1, step=1, precision=2, subtype="FACTOR",
+        description="Share of compression error that may be added so that fewer triangles lie in more than one "
+                    "cluster. Buys faster drawing in programs that draw cluster by cluster; the preview gains "
+                    "nothing. 0 is off, 0.05 to 0.1 is usual",
+    )
     exposure: FloatProperty(
         name="Exposure", update=_redraw, default=0.0, soft_min=-5.0, soft_max=5.0, step=10, precision=2,
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
@@ -71,8 +116,18 @@ class PRTSettings(bpy.types.PropertyGroup):
 
     def overrides(self) -> dict[str, str]:
         """What these settings change in their preset, by name, as `make_settings` takes it."""
-        changed = {"order": str(self.order)} if self.order != PRESETS[self.preset].order else {}
+        preset = PRESETS[self.preset]
+        # What a file of an older version has not set is the preset's.
+        found = {name: getattr(self, name) for name in EXPERT if self.is_property_set(name)} | {"order": self.order}
+        # Blender keeps single precision: 0.3 comes back as 0.30000001.
+        texts = {name: f"{value:.6g}" if isinstance(value, float) else str(value) for name, value in found.items()}
+        changed = {name: text for name, text in texts.items() if not _same(text, getattr(preset, name))}
         return changed if self.bounces else {**changed, "bounces": "0"}
+
+
+def _same(text: str, value: object) -> bool:
+    """Whether a property's text says the same as a setting's value."""
+    return abs(float(text) - value) < 1e-6 if isinstance(value, float) else text == str(value)
 
 
 class PRTBakedObject(bpy.types.PropertyGroup):

@@ -50,6 +50,29 @@ class PRT_PT_bake(_Sidebar, bpy.types.Panel):
                 _wrapped(box, context, line)
 
 
+class PRT_PT_expert(_Sidebar, bpy.types.Panel):
+    """What highlights, translucent materials and other programs cost and get."""
+
+    bl_idname = "PRT_PT_expert"
+    bl_parent_id = "PRT_PT_bake"
+    bl_label = "Expert Settings"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings = self.layout, context.scene.prt
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.enabled = not context.window_manager.prt.running
+        column = layout.column(heading="Highlights")
+        column.prop(settings, "glossy_rows")
+        column = column.column()
+        column.active = settings.glossy_rows != "0"
+        column.prop(settings, "glossy_albedo")
+        column.prop(settings, "glossy_window")
+        layout.prop(settings, "subsurface")
+        layout.prop(settings, "coherence")
+
+
 class PRT_PT_preview(_Sidebar, bpy.types.Panel):
     """The viewport's picture under the present light."""
 

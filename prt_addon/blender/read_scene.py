@@ -72,6 +72,8 @@ def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | N
         targets = _targets(depsgraph, visible, target_names)
         albedo_reader, surface_reader = AlbedoReader(depsgraph.scene, warnings), SurfaceReader(warnings)
         gathered = _gather(depsgraph, visible, (albedo_reader, surface_reader), warnings)
+        if not targets:
+            _skip_empty(gathered, warnings)
         _check_targets(targets, gathered, visible)
         albedo_reader.evaluate()
         everything = target_names is None and not targets
@@ -177,6 +179,16 @@ def _check_finite(positions: NDArray[np.float32], name: str) -> None:
     if bad:
         raise BadScene(name, f"{bad} vertices have no finite coordinates",
                        "Delete them, or mend the modifier that makes them")
+
+
+def _skip_empty(gathered: dict[str, _Gathered], warnings: list[str]) -> None:
+    """Take out objects without faces, with a warning each, unless nothing else would be left."""
+    empty = [name for name, entry in gathered.items()
+             if not any(len(part.arrays.triangles) for part in entry.parts.values())]
+    if len(empty) < len(gathered):
+        for name in empty:
+            warnings.append(f"{gathered[name].scene_object.name}: the mesh has no faces, so it is not baked")
+            del gathered[name]
 
 
 def _check_targets(targets: dict[str, bpy.types.Object], gathered: dict[str, _Gathered],
