@@ -80,7 +80,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
         seconds["subsurface"] = 0.2 + translucent * columns * needs.channels * SECONDS_PER_SUBSURFACE_VALUE
     seconds["encode"] = 0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
     if settings.error_receivers:
-        rays["errors"] = 2 * settings.error_receivers * settings.error_paths
+        # Diffuse light and highlights are measured apart, each with paths of about two rays.
+        rays["errors"] = (4 if glossy else 2) * settings.error_receivers * settings.error_paths
         seconds["errors"] = 0.1 + rays["errors"] / PATH_RAYS_PER_SECOND
     stored = receivers * 4 * (1 + 4 * -(-settings.vectors // 4) + 4) + 4 * settings.clusters * (
         settings.vectors + 1) * columns * needs.channels * (1 + (len(surfaces.functions) if glossy else 0))
