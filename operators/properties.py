@@ -93,7 +93,7 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "costs some of their sharpness, and nothing where nothing rings",
     )
     subsurface: BoolProperty(
-        name="Light Through Bodies", default=True,
+        name="Subsurface Light", default=True,
         description="Light travels inside translucent materials (subsurface weight). Buys wax, skin and marble that "
                     "glow; costs its own stage of the bake and three colour channels. Off: they are opaque",
     )
@@ -139,6 +139,7 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     highlight_error: FloatProperty(default=-1.0)
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
+    error_spent: FloatProperty()
     stale: StringProperty()
 
 

@@ -63,7 +63,7 @@ class PRT_PT_expert(_Sidebar, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.enabled = not context.window_manager.prt.running
-        column = layout.column(heading="Highlights")
+        column = layout.column()
         column.prop(settings, "glossy_rows")
         column = column.column()
         column.active = settings.glossy_rows != "0"
@@ -121,11 +121,11 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
 def _details(line: bpy.types.PropertyGroup) -> list[str]:
     """What came out for one object, in short lines."""
     lines = [_plural(line.clusters, "cluster")] * bool(line.clusters)
-    errors = [f"{100.0 * value:.2f} % {part}"
-              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlights")) if value >= 0.0]
-    lines += [f"error {', '.join(errors)}"] * bool(errors)
+    lines += [f"{part} error {100.0 * value:.2f} %"
+              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlight")) if value >= 0.0]
     if line.overdraw > 0.0:
-        lines.append(f"overdraw {line.overdraw_before:.2f}, coherent {line.overdraw:.2f}")
+        lines.append(f"overdraw {line.overdraw_before:.2f} to {line.overdraw:.2f}")
+        lines.append(f"for {100.0 * line.error_spent:.1f} % of squared error")
     return lines
 
 
