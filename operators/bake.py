@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.baking.settings import make_settings
+from ..prt_addon.baking.settings import make_settings, parse_overrides
 from . import live_preview
 from .bake_session import BakeSession, baked_message
 from .job_mixin import JobMixin
@@ -18,6 +18,12 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
     bl_idname = "prt.bake"
     bl_label = "Bake Light Transfer"
     bl_options = {"UNDO"}
+
+    overrides: bpy.props.StringProperty(
+        name="Overrides", options={"HIDDEN", "SKIP_SAVE"},
+        description="Any setting by name, as --set of the command line takes it: \"directions=4096, vectors=12\". "
+                    "They count before the panel's",
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -33,7 +39,8 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
         return True
 
     def start_job(self, context: bpy.types.Context) -> BakeSession:
-        settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
+        settings = make_settings(context.scene.prt.preset,
+                                 context.scene.prt.overrides() | parse_overrides(self.overrides))
         return BakeSession.start(context.evaluated_depsgraph_get(), settings, None)
 
     def finish_job(self, context: bpy.types.Context, job: BakeSession) -> str:

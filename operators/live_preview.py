@@ -151,11 +151,14 @@ def _read_bakes() -> None:
         line.clusters, line.points = int(baked.bases.shape[0]), len(baked.cluster)
         own, coherence = baked.header.get("own_errors", {}), baked.header.get("coherence") or {}
         for name, part, key in (("error", "diffuse", "errors"), ("highlight_error", "highlights", "highlight_errors")):
-            # The object's own error where it had enough points to measure, else that of the whole bake.
-            whole = baked.header.get(key, {}).get("total", -1.0) if name == "error" or baked.functions else -1.0
+            # The object's own error; where it had too few points to measure one, those of the whole bake.
+            whole = -1.0 if own or (part == "highlights" and not baked.functions) else \
+                baked.header.get(key, {}).get("total", -1.0)
             setattr(line, name, float(own.get(part, whole)))
         line.overdraw = float(coherence.get("both", 0.0))
         line.overdraw_before = float(coherence.get("before", 0.0))
+        spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
+        line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
         _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)))
     _read_stale()
 

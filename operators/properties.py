@@ -25,7 +25,7 @@ PRESET_ITEMS = (
 LIGHTING_ITEMS = (
     ("environment", "Environment", "World and Suns. Costs what order and shadows cost", 0),
     ("local", "Local Lights", "Point, Spot and Area lamps that move after the bake, with the light that they bounce. "
-                              "Costs one more solution for each light of the cloud, and no highlights are baked", 1),
+                              "Costs one more solution for each light of the cloud", 1),
     ("both", "Both", "World, Suns and lamps that move. Costs both bakes, and one set of data holds both", 2),
 )
 LIGHTINGS = {"environment": "environment", "local": "local", "both": "environment,local"}
@@ -87,7 +87,6 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Light from surface to surface: colours bleed, corners brighten. Costs about as long again as "
                     "the shadows",
     )
-    exposure: FloatProperty(
         name="Exposure", update=_redraw, default=0.0, soft_min=-5.0, soft_max=5.0, step=10, precision=2,
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
     )
@@ -189,6 +188,7 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     highlight_error: FloatProperty(default=-1.0)
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
+    error_spent: FloatProperty()
     stale: StringProperty()
 
 

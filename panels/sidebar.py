@@ -75,7 +75,6 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
-        column.active = settings.lighting != "local"  # the bounced light of lamps is diffuse
         column.prop(settings, "glossy_rows")
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
@@ -159,11 +158,11 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
 def _details(line: bpy.types.PropertyGroup) -> list[str]:
     """What came out for one object, in short lines."""
     lines = [_plural(line.clusters, "cluster")] * bool(line.clusters)
-    errors = [f"{100.0 * value:.2f} % {part}"
-              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlights")) if value >= 0.0]
-    lines += [f"error {', '.join(errors)}"] * bool(errors)
+    lines += [f"{part} error {100.0 * value:.2f} %"
+              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlight")) if value >= 0.0]
     if line.overdraw > 0.0:
-        lines.append(f"overdraw {line.overdraw_before:.2f}, coherent {line.overdraw:.2f}")
+        lines.append(f"overdraw {line.overdraw_before:.2f} to {line.overdraw:.2f}")
+        lines.append(f"for {100.0 * line.error_spent:.1f} % of squared error")
     return lines
 
 

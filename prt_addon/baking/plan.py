@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ..compression.global_frame import CHUNK, MOST_WIDTH, WIDE
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh
@@ -96,7 +97,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
         seconds["subsurface"] = 0.2 + translucent * columns * needs.channels * SECONDS_PER_SUBSURFACE_VALUE
     seconds["encode"] = 0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
     if settings.error_receivers:
-        rays["errors"] = 2 * settings.error_receivers * settings.error_paths
+        # Diffuse light and highlights are measured apart, each with paths of about two rays.
+        rays["errors"] = (4 if glossy else 2) * settings.error_receivers * settings.error_paths
         seconds["errors"] = 0.1 + rays["errors"] / PATH_RAYS_PER_SECOND
     peak, disk = _memory(scene, settings, needs, surfaces, receivers)
     return Plan(needs, surfaces, receivers, seconds, rays, peak, _stored(scene, settings, needs, surfaces), disk)

@@ -159,6 +159,17 @@ def make_settings(preset: str, overrides: dict[str, str] | None = None) -> BakeS
     return check(replace(PRESETS[preset], **values))
 
 
+def parse_overrides(text: str) -> dict[str, str]:
+    """Overrides for `make_settings` from "name=value, name=value". Raises BadArguments."""
+    found = {}
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        name, equals, value = item.partition("=")
+        if not (name.strip() and equals):
+            raise BadArguments(f"overrides {item!r}", "it is not NAME=VALUE", "Write name=value, name=value")
+        found[name.strip()] = value.strip()
+    return found
+
+
 def _parsed(name: str, kind: Any, text: str) -> Any:
     """A setting's value from its text."""
     try:

@@ -196,7 +196,21 @@ spec.loader.exec_module(tool)
 tool.load_extension()
 sys.modules["prt"].register()
 bpy.ops.wm.open_mainfile(filepath=sys.argv[2])
-bpy.context.scene.prt.preset = "draft"
+settings = bpy.context.scene.prt
+assert settings.overrides() == {}
+settings.preset = "draft"
+assert settings.overrides() == {} and settings.glossy_rows == "9"
+settings.glossy_rows, settings.glossy_albedo, settings.coherence, settings.subsurface = "4", 0.3, 0.05, False
+assert settings.overrides() == {"glossy_rows": "4", "coherence": "0.05", "subsurface": "False"}
+assert bpy.ops.prt.bake(overrides="directions=64, coherence=0.1") == {"FINISHED"}
+import json
+header = json.loads(next(m for m in bpy.data.meshes if "prt_header" in m)["prt_header"])
+used = header["settings"]
+assert (used["directions"], used["coherence"], used["glossy_rows"], used["subsurface"]) == (64, 0.1, 4, False)
+assert header["coherence"]["both"] <= header["coherence"]["before"]
+settings.preset = "standard"
+assert settings.overrides() == {}
+settings.preset = "draft"
 assert bpy.ops.prt.bake() == {"FINISHED"}
 assert not bpy.context.window_manager.prt.running
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[3])

@@ -180,6 +180,17 @@ def test_render_visibility_decides_and_the_viewports_does_not(scene: bpy.types.S
     assert bpy.data.objects["Eye"].hide_get()
 
 
+def test_an_object_without_faces_is_skipped_by_name_unless_it_was_asked_for(scene: bpy.types.Scene) -> None:
+    add_cube("Cube")
+    add_mesh("Points", TRIANGLE[0], [])
+    warnings: list[str] = []
+    mesh, = read_objects(depsgraph(), None, warnings)
+    assert mesh.name == "Cube" and mesh.is_target
+    assert [line for line in warnings if line.startswith("Points: ") and "no faces" in line]
+    with pytest.raises(BadScene, match="no faces"):
+        read_objects(depsgraph(), ["Points"])
+
+
 @pytest.mark.parametrize(("make", "targets", "name", "words"), [
     (lambda: setattr(add_cube("Hidden"), "hide_render", True), ["Hidden"], "Hidden", "hidden in renders"),
     (lambda: add_cube(), ["Missing"], "Missing", "no object of this name"),

@@ -351,7 +351,7 @@ def test_a_near_area_light_shines_from_all_of_its_face(size):
                             np.zeros((1, 16), np.float32))
     up, along = np.tile(np.float32([0, 0, 1]), (count, 1)), np.tile(np.float32([1, 0, 0]), (count, 1))
     ball = Ball(surfaces, floor.positions.astype(np.float32), up, along, np.zeros((count, 3), np.float32),
-                np.zeros((1, 1, 17, 1, 1)))
+                np.zeros((1, 1, 17, 1, 1)), floor.triangles)
     matrix = np.eye(4)
     matrix[:3, :3] = [[np.cos(0.5), 0, np.sin(0.5)], [0, 1, 0], [-np.sin(0.5), 0, np.cos(0.5)]]
     matrix[:3, 3] = (0, 0, 1.0)

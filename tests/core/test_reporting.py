@@ -17,8 +17,9 @@ import pytest
 
 from prt_addon.errors import StorageError
 from prt_addon.reporting import svg_plots, wording
+from prt_addon.reporting.headline import headline
 from prt_addon.reporting.html_report import render
-from prt_addon.reporting.report_file import problem_of, read_report, write_report
+from prt_addon.reporting.report_file import HIGHLIGHT_ERROR_NAMES, problem_of, read_report, write_report
 from prt_addon.reporting.stages import StageTimer, reset_peak_bytes
 
 
@@ -48,6 +49,52 @@ def made_up_report() -> dict[str, Any]:
                       {"check": "brightest", "value": 1.3, "limit": 1.02, "verdict": "raise gather_directions"}],
         "resumed": [],
     }
+
+
+def with_highlights() -> dict[str, Any]:
+    """The same with two measured objects, highlights and coherence."""
+    report = made_up_report()
+    entry = {"relative_rms": 0.031, "interval": [0.02, 0.04], "receivers": 64, "reference_rays": 1_000_000}
+    report["highlight_errors"] = {name: copy.deepcopy(entry) for name in HIGHLIGHT_ERROR_NAMES}
+    report["errors"]["total"]["objects"] = {
+        name: {"relative_rms": value, "interval": [0.0, 0.1], "receivers": 20}
+        for name, value in (("Suzanne", 0.008), ("Ground <1> & co", 0.016))}
+    report["highlight_errors"]["total"]["objects"] = {
+        "Suzanne": {"relative_rms": 0.052, "interval": [0.0, 0.1], "receivers": 20}}
+    report["covers"] = ["Light through translucent bodies is not part of it"]
+    report["clusters"]["objects"]["Suzanne"]["coherence"] = {
+        "before": 1.93, "reclassified": 1.72, "superclustered": 1.61, "both": 1.48, "squared_error_before": 0.2,
+        "squared_error_after": 0.21, "moved": 321, "superclusters": 12}
+    return report
+
+
+def test_headline_says_what_it_covers_and_names_the_worst_object() -> None:
+    assert headline(made_up_report()) == "Total error 1.2 % (diffuse)"
+    assert headline(with_highlights()) == (
+        "Total error 1.2 % (diffuse), 3.1 % (highlights); worst: Suzanne, 5.2 % (highlights)")
+    metal = with_highlights() | {"errors": {}}
+    assert headline(metal) == "Total error 3.1 % (highlights)"
+    assert headline(made_up_report() | {"errors": {}}) == "The error was not measured"
+
+
+def test_page_shows_highlights_objects_and_coherence(tmp_path: Path) -> None:
+    report = with_highlights()
+    write_report(tmp_path / "report.json", report)
+    text = render(read_report(tmp_path / "report.json"))
+    page = _Page()
+    page.feed(text)
+    page.close()
+    assert page.open == []
+    for told in ("3.1 % (highlights)", "worst: Suzanne", "more glossy_rows", "Reflections in reflections",
+                 "Object by object", "5.2 %", "1.93", "1.72", "1.61", "1.48", "321", "5.0 %", "translucent bodies"):
+        assert told in text, told
+    assert "Coherence" not in render(made_up_report())
+
+
+def test_a_report_whose_highlight_errors_lack_a_part_is_refused() -> None:
+    report = with_highlights()
+    del report["highlight_errors"]["rows"]
+    assert problem_of(report) == "highlight_errors.rows: missing"
 
 
 class _Page(HTMLParser):

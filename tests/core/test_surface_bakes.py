@@ -156,6 +156,34 @@ def test_a_dark_metal_keeps_its_highlight_and_a_dark_plastic_does_not():
     assert not baked(replace(mesh, materials=(black,))).objects["sphere"].functions
 
 
+def test_light_through_bodies_is_not_computed_twice(tmp_path):
+    """Resumed after the subsurface stage: the same rows and the same checks, without that stage's work."""
+    meshes = [replace(sphere(subdivisions=2, albedo=WAX.base_colour), materials=(WAX,))]
+    scene, settings = SceneMesh.assemble(meshes), make_settings("standard", FEW)
+    folder = write_job(tmp_path, scene, settings)
+    steps = run_job(folder)
+    while next(steps).stage != "encode":
+        pass
+    steps.close()
+    drain(run_job(folder))
+    resumed, whole = read_result(folder), exhaust(bake(scene, settings))
+    assert "subsurface" in resumed.report["resumed"]
+    np.testing.assert_array_equal(whole.objects["sphere"].bases, resumed.objects["sphere"].bases)
+    assert whole.report["stability"] == resumed.report["stability"]
+
+
+def test_progress_of_highlights_never_falls_and_names_each_stage_at_once():
+    """Two metals that see each other are done in two rounds; the stage shows before its first block is done."""
+    meshes = [replace(sphere(subdivisions=2, albedo=(0, 0, 0), centre=(0, 0, 1.2)), materials=(GOLD,)),
+              replace(plane(size=6.0, cells=8, albedo=(0.5, 0.4, 0.3)), materials=(replace(GOLD, metallic=0.5),))]
+    steps = bake(SceneMesh.assemble(meshes), make_settings("standard", FEW | {"error_receivers": "8"}))
+    seen = list(steps)
+    fractions = [progress.fraction for progress in seen]
+    assert fractions == sorted(fractions)
+    stages = list(dict.fromkeys(progress.stage for progress in seen))
+    assert stages == ["prepare", "gather", "direct", "interreflection", "glossy", "encode", "errors"]
+
+
 def test_an_interrupted_bake_resumes_with_the_same_result(tmp_path):
     meshes = [replace(sphere(subdivisions=2, albedo=(0, 0, 0), centre=(0, 0, 1.2)), materials=(GOLD,)),
               plane(size=6.0, cells=8, albedo=(0.5, 0.4, 0.3))]
