@@ -5,7 +5,7 @@ Shadow rays and gather rays are two sets, so a receiver's sky and its surfaces, 
 not fill its hemisphere exactly: in a white world white surfaces came out up to 6 % too bright or too dark (256 and 128
 directions, albedo 0.99). Their sum is known in closed form, so one factor for each row of the operator removes that
 error, where it is largest: in the constant term, which carries most of the light. Measured on a ball and on boxes over
-a floor in a white world, error of all bounces against 8,192 directions: 3 to 10 times smaller at albedo 0.8, 25 and
+a floor in a white world, error of all bounces against 8,192 directions: 3 to 7 times smaller at albedo 0.8, 25 and
 more at 0.99.
 """
 

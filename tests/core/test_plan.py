@@ -34,16 +34,15 @@ def still_life(kind, subdivisions=4):
 
 
 CHILD = """
-import json, resource, sys
+import json, sys
+from prt_addon.reporting.stages import peak_bytes
 from tests.core.test_plan import QUICK, bake, exhaust, make_plan, make_settings, still_life
 kind, preset, subdivisions = sys.argv[1:]
 scene = still_life(kind, int(subdivisions))
 settings = make_settings(preset, {**QUICK, "encoder": "static"})
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-stages = exhaust(bake(scene, settings)).report["stages"]
-# A stage starts a new peak where the system can, so that the process' own is the last stage's.
-peak = max([stage["peak_bytes"] for stage in stages] + [1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss])
-print(json.dumps([1024 * before, peak, make_plan(scene, settings, None).peak_bytes]))
+before = peak_bytes()  # not getrusage: there a child begins with the peak of the process that started it
+peak = max(stage["peak_bytes"] for stage in exhaust(bake(scene, settings)).report["stages"])
+print(json.dumps([before, peak, make_plan(scene, settings, None).peak_bytes]))
 """
 
 
