@@ -87,6 +87,7 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Light from surface to surface: colours bleed, corners brighten. Costs about as long again as "
                     "the shadows",
     )
+    exposure: FloatProperty(
         name="Exposure", update=_redraw, default=0.0, soft_min=-5.0, soft_max=5.0, step=10, precision=2,
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
     )

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ..compression.global_frame import CHUNK, MOST_WIDTH, WIDE
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh

@@ -150,8 +150,8 @@ class _Bake:
             receivers, transfer, visibility = yield from self._direct(gathered)
         if gathered is not None:
             with self.timer.stage("interreflection"):
-                # Fewer shadow rays than gather rays know less of what a receiver sees than these.
-                if len(self.directions[0]) >= len(self.gather_directions[0]):
+                # The few shadow rays of a bake for lamps alone know less of what a receiver sees than its gather rays.
+                if self.settings.distant_light:
                     gathered = balanced(gathered, transfer[:, 0])
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer

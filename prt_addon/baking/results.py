@@ -35,12 +35,9 @@ REPORT_SCHEMA = 1
 # (transport/energy_balance.py), whatever the numbers of directions; what is left above 1 is light that is seen twice at
 # interpolated corners and horizons. Measured at most 1.0002 at draft and standard, albedo 0.8 and 0.99, where 128
 # gather_directions without that balance gave 1.058.
-ENERGY_LIMIT = 1.005
+ENERGY_LIMIT, LOOSE_ENERGY_LIMIT = 1.005, 1.1
 # Few functions of the view overshoot a highlight's edge by up to a seventh; what they undershoot is bounded at black.
 DARKEST_VIEW, BRIGHTEST_VIEW = 0.01, 1.15
-# Standard deviations by which the brightest of thousands of receivers may be too bright, and rounding and the energy
-# left out of the bounces, which single precision or a setting add.
-BRIGHTEST_BY, ENERGY_ROUNDING = 3.0, 1e-3
 # An object most of whose receivers see no sky and no surface that does is probably wound inwards.
 DARK_LIMIT = 0.5
 # The dipole is a half-space's: a body that loses more of its light by its sides looks like another material.
@@ -110,20 +107,6 @@ def _check(check: str, value: float, limit: float, good: str, bad: str) -> dict[
     return {"check": check, "value": float(value), "limit": float(limit), "verdict": good if value <= limit else bad}
 
 
-def energy_error(directions: int, gather_directions: int | None) -> float:
-    """Standard deviation of a white receiver's radiance in a white unit environment, whose truth is 1 at most.
-
-    The sky's part is known from `directions` over the sphere, the surfaces' from others (None: nothing is gathered), so
-    what one counts as sky the other may count as surface too. N directions are cells of solid angle 4 pi / N. A cell
-    that the border between sky and surface cuts counts whole or not at all, at random: a variance of 1/6 of its weight
-    w squared (u (1 - u), u even over 0..1). A border of length pi (across the hemisphere; a straight line in random
-    position crosses 4 / pi cells for each of its width in length) cuts 4 / pi * pi / sqrt(4 pi / N) of them, with w = 4
-    cos / N and cos^2 = 1/2 on average. Together 1.5 N^-1.5.
-    """
-    counts = [directions] if gather_directions is None else [directions, gather_directions]
-    return float(np.sqrt(sum(1.5 * count ** -1.5 for count in counts)))
-
-
 def stability_of(scene: SceneMesh, transfer: NDArray[np.float32], keys: NDArray[np.int64], gathered: Gather | None,
                  bounced: Interreflection | None, settings: BakeSettings) -> list[dict[str, Any]]:
     """Checks that hold for every physically possible bake, with what it means where they do not."""
@@ -131,16 +114,10 @@ def stability_of(scene: SceneMesh, transfer: NDArray[np.float32], keys: NDArray[
     checks = [_check("values that are not finite", float((~np.isfinite(values)).sum()), 0.0, "ok",
                      "broken: please report this scene")]
     white = values[:, 0].max(axis=1, initial=0.0) * np.sqrt(4.0 * np.pi)
-    error = energy_error(settings.directions, settings.gather_directions if gathered is not None else None)
-    # Balanced with as many shadow rays (transport/energy_balance.py), the operator's own error is gone.
-    balanced = gathered is not None and settings.directions >= settings.gather_directions
-    limit = ENERGY_LIMIT if balanced else 1.0 + BRIGHTEST_BY * error + ENERGY_ROUNDING
-    checks.append(_check("brightest receiver in a white unit environment", float(white.max(initial=0.0)),
-                         1.0 + BRIGHTEST_BY * error + ENERGY_ROUNDING, "ok",
-                         "more light than there is: raise directions and gather_directions"))
-    checks.append(_check("mean receiver in a white unit environment", float(white.mean()) if len(white) else 0.0,
-                         1.0 + error + ENERGY_ROUNDING, "ok",
-                         "more light than there is: raise directions and gather_directions"))
+    # Where only lamps are baked, few shadow rays check the scene, and the operator is not balanced with them.
+    limit = ENERGY_LIMIT if settings.distant_light else LOOSE_ENERGY_LIMIT
+    checks.append(_check("brightest receiver in a white unit environment", float(white.max(initial=0.0)), limit,
+                         "ok", "more light than there is: raise directions and gather_directions"))
     for target in scene.objects:
         if target.is_target:
             mine = (keys >= target.points.start) & (keys < target.points.stop)

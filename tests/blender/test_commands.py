@@ -209,6 +209,8 @@ used = header["settings"]
 assert (used["directions"], used["coherence"], used["glossy_rows"], used["subsurface"]) == (64, 0.1, 4, False)
 assert header["coherence"]["both"] <= header["coherence"]["before"]
 settings.preset = "standard"
+assert settings.overrides() == {"coherence": "0.05", "subsurface": "False"}  # the scene's own, whatever the preset
+settings.coherence, settings.subsurface = 0.0, True
 assert settings.overrides() == {}
 settings.preset = "draft"
 assert bpy.ops.prt.bake() == {"FINISHED"}

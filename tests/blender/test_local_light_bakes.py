@@ -18,7 +18,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
     sys.modules["prt"] = types.ModuleType("prt")
     sys.modules["prt"].__path__ = [str(ROOT)]
 
-FAST = ["--preset", "draft", "--set", "directions=64", "--set", "gather_directions=512", "--set", "spacing=0",
+FAST = ["--preset", "draft", "--set", "directions=1024", "--set", "gather_directions=512", "--set", "spacing=0",
         "--set", "error_receivers=0", "--set", "bounce_error=1e-3", "--set", "compression_error=1e-3",
         "--set", "encoder=iterative", "--set", "vectors=12", "--set", "cloud_lights=125",
         "--set", "merge_response=0.01", "--set", "zone_receivers=200"]
