@@ -274,39 +274,55 @@ def _solve_highlights(solver: LightSolver, cloud: LightCloud, missing: set[tuple
     """Rows (g, functions, columns, channels) of the highlights, zone by zone: a glossy receiver reflects what the
     lights of its own zone do to all surfaces that it sees, near and far, direct light included.
 
-    Glossy surfaces send to each other as much as they get, but evenly (they are in the solver's albedo). Each zone's
-    lights are solved once more for this, because their field at all receivers is too large to be kept from the first
-    time (receivers x lights x channels); the merged lights of `missing` get their diffuse transfer on the way.
+    Glossy surfaces send to each other as much as they get, but evenly (they are in the solver's albedo). Lights are
+    solved once more for this, because their field at all receivers is too large to be kept from the first time
+    (receivers x lights x channels), each place once for all zones; the merged lights of `missing` get their diffuse
+    transfer on the way.
     """
     gathered, functions = solver.gathered, cloud.emission_order ** 2
     row, of_receiver = _rows_of_points(gathered, len(zone)), zone[highlights.points]
     kernels = highlights.surfaces.kernels
     channels = max(kernels[0].shape[2], solver.albedo.shape[1])
     result = np.zeros((len(highlights.points), kernels[0].shape[0], cloud.columns, channels), np.float32)
-    done = 0
-    for number in np.unique(of_receiver):
-        which = np.flatnonzero(of_receiver == number)
-        mine, inside = highlights.of(which), members[number]
+    which = {int(number): np.flatnonzero(of_receiver == number) for number in np.unique(of_receiver)}
+    mine = {number: highlights.of(receivers) for number, receivers in which.items()}
+    places, users = _places_of(cloud, list(which))
 
-        def take(part: slice, response: NDArray[np.float32], number: int = int(number),
-                 inside: NDArray[np.int64] = inside) -> None:
-            for light in range(part.start, part.stop):
+    def take(part: slice, response: NDArray[np.float32]) -> None:
+        for offset, lights in enumerate(users[part]):
+            for number, light in lights:
                 if (number, light) in missing:
-                    columns = slice((light - part.start) * functions, (light - part.start + 1) * functions)
+                    inside, columns = members[number], slice(offset * functions, (offset + 1) * functions)
                     transfer[inside, cloud.columns_of(number, light)] = response[row[inside], columns]
 
-        def view(part: slice, radiance: NDArray[np.float32], which: NDArray[np.int64] = which,
-                 mine: LitHighlights = mine) -> Generator[float]:
-            source = DiffuseRadiance(gathered.hits, solver.scene, gathered.receivers, radiance)
-            light = IndirectLight(gathered.hits, source, mine.places, mine.blocked)
-            columns = slice(part.start * functions, part.stop * functions)
-            result[which, :, columns] = yield from reflected_light(solver.tracer, mine.surfaces, radiance.shape[1],
-                                                                   light)
+    def view(part: slice, radiance: NDArray[np.float32]) -> Generator[float]:
+        for done, number in enumerate(which):
+            here = [(offset, light) for offset, lights in enumerate(users[part]) for n, light in lights if n == number]
+            if not here:
+                continue
+            offset, light = np.array(here).T
+            order = np.arange(functions)
+            source = DiffuseRadiance(gathered.hits, solver.scene, gathered.receivers,
+                                     radiance[:, (offset[:, None] * functions + order).ravel()])
+            indirect = IndirectLight(gathered.hits, source, mine[number].places, mine[number].blocked)
+            rows = yield from _part(reflected_light(solver.tracer, mine[number].surfaces, len(here) * functions,
+                                                    indirect), done / len(which), (done + 1) / len(which))
+            for column, target in enumerate((light[:, None] * functions + order).ravel()):
+                result[which[number], :, target] = rows[:, :, column]
 
-        share = len(which) / len(of_receiver)
-        yield from _part(solver.solve(cloud.lights_of(number), take, view), done, done + share)
-        done += share
+    yield from solver.solve(places, take, view)
     return result
+
+
+def _places_of(cloud: LightCloud, zones: list[int]) -> tuple[NDArray[np.float64], list[list[tuple[int, int]]]]:
+    """The places (n, 3) of these zones' lights, each once, and who has a light there: (zone, light) pairs. Lights that
+    did not merge are the same in all zones."""
+    users: dict[bytes, list[tuple[int, int]]] = {}
+    for number in zones:
+        for light, place in enumerate(cloud.lights_of(number)):
+            users.setdefault(np.ascontiguousarray(place).tobytes(), []).append((number, light))
+    places = np.array([np.frombuffer(key, np.float64) for key in users]).reshape(-1, 3)
+    return places, list(users.values())
 
 
 def _part(steps: Generator[float, None, Any], first: float, last: float) -> Generator[float, None, Any]:

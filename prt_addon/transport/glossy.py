@@ -108,7 +108,9 @@ def reflected_light(tracer: Tracer, surfaces: GlossySurfaces, columns: int, indi
     """Yield progress, return M (g, rows, columns, channels) float32 of light from surfaces alone, of any columns.
 
     For the lights of a cloud, whose direct light is no part of a bake. Rows are as they are fitted, whatever
-    `surfaces.functions` says: the bound of `positivity` is for a white world, which no column is here.
+    `surfaces.functions` says: the bound of `positivity` is for a white world, which no column is here, and what lamps
+    make of the surfaces around has no edge as sharp as the sky's beside a wall. Nor is there an order of light to
+    window: a column is one light, whose image in the surfaces is held by the incident functions alone.
     """
     channels = max(surfaces.kernels[0].shape[2], indirect.source.values // columns)
     out = np.empty((len(surfaces), surfaces.kernels[0].shape[0], columns, channels), np.float32)

@@ -15,15 +15,16 @@ is as near to F elsewhere, but at the horizon leaves a tenth of F at roughness 0
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..basis import hemisphere
+from ..basis import hemisphere, spherical_harmonics
 from ..basis.hemisphere import Indices
 from ..basis.spherical_harmonics import expand_bands
 from ..linear_algebra import multiply, symmetric_eigenpairs
-from .brdf import Reflection, outgoing_matrix, ringing_window
+from .brdf import Reflection, outgoing_matrix
 
 Array = NDArray[np.float64]
 
@@ -35,32 +36,82 @@ LAMP_ORDER = 6
 SMALLEST = 1e-3
 
 
+# Negative lobe, relative to the peak of the same view, that a highlight may keep where it is seen from above: deeper
+# ones show as dark rings. Rows of their own ring more towards grazing views, which no window on lamps mends.
+DEEPEST_LOBE = 0.05
+_RINGS_SEEN_AT, _HALVINGS, _STRONGEST = 30.0, 12, 0.05
+
+
 def lamp_kernel(reflection: Reflection, functions: Indices, window: bool = True) -> Array:
     """C (rows, LAMP_ORDER^2, channels): rows of exit radiance are C y(s) times E / pi of a white diffuse surface.
 
-    s: the lamp's direction in the point's own frame. window: damp bands as `ringing_window` does for distant light, so
-    that a highlight has no deeper dark rings than a Sun's. Raises ValueError where the reflection is of a lower order.
+    s: the lamp's direction in the point's own frame. window: damp bands by the weakest heat kernel (see
+    `spherical_harmonics.window`) that keeps lobes above -DEEPEST_LOBE; none at roughness 0.5. (The window of distant
+    light is for its own order and far stronger: it would make the error at 0.5, 25 rows, seen straight on 25 % instead
+    of 10.) Raises ValueError where the reflection is of a lower order.
     """
     if reflection.order <= LAMP_ORDER:
         raise ValueError(f"a lamp's kernel needs a reflection of order {LAMP_ORDER + 1}, not {reflection.order}")
-    wide = (LAMP_ORDER + 1) ** 2
-    times_cosine = cosine_product(LAMP_ORDER)
-    fitted = outgoing_matrix(reflection, functions)[:, :wide]
-    gram = multiply(multiply(times_cosine, hemisphere.gram_matrix(np.arange(wide))), times_cosine.T)
-    values, vectors = symmetric_eigenpairs(gram)
-    kept = values >= SMALLEST * values[0]
-    inverse = multiply(vectors[:, kept] / values[kept], np.ascontiguousarray(vectors[:, kept].T))
-    to_kernel = multiply(np.ascontiguousarray(times_cosine.T), inverse)
-    if window:
-        to_kernel *= expand_bands(ringing_window(reflection, LAMP_ORDER))
-    flat = np.ascontiguousarray(np.moveaxis(fitted, 2, 1)).reshape(-1, wide)
-    kernel = multiply(flat, to_kernel)
-    # Lamps all around are a white world: as for K, the smallest change that returns its light exactly is of rank one.
-    white = np.sum(times_cosine * hemisphere.gram_matrix(np.arange(wide))[0], axis=1)
-    missing = flat[:, 0] - np.sum(kernel * white, axis=1)
-    kernel += missing[:, None] * (white / np.sum(white ** 2))
-    kernel = math.pi * kernel.reshape(fitted.shape[0], fitted.shape[2], -1)
-    return np.ascontiguousarray(np.moveaxis(kernel, 1, 2))
+    fit = _Fit.of(reflection, functions)
+    views, lamps = _profile_directions()
+    seen = hemisphere.evaluate(functions, views)
+    values = spherical_harmonics.evaluate(LAMP_ORDER, lamps) * lamps[:, 2:]
+
+    def rings(strength: float) -> bool:
+        profile = multiply(multiply(seen, fit.kernel(strength).mean(axis=2)), np.ascontiguousarray(values.T))
+        return bool(np.any(profile.min(axis=1) < -DEEPEST_LOBE * profile.max(axis=1)))
+
+    if not window or not rings(0.0):
+        return fit.kernel(0.0)
+    low, high = 0.0, _STRONGEST
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if rings(middle) else (low, middle)
+    return fit.kernel(high)
+
+
+def _profile_directions() -> tuple[Array, Array]:
+    """Views (v, 3) at which rings are looked for, and lamps (n, 3) all over the hemisphere."""
+    angle, turn = np.radians(_RINGS_SEEN_AT), np.pi / 4 * np.arange(4)
+    slanted = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.full(4, np.cos(angle))], axis=1)
+    z, turn = np.linspace(0.02, 1.0, 25)[:, None], np.pi / 8 * np.arange(16)
+    radius = np.sqrt(1.0 - z * z)
+    lamps = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.broadcast_to(z, (25, 16))], axis=-1)
+    return np.concatenate([[[0.0, 0.0, 1.0]], slanted]), lamps.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """plain: (rows, channels, n^2) the fit without a window, over pi; whole: (rows, channels) integral of F over lamps;
+    white: (n^2,) integral of z y_j."""
+
+    plain: Array
+    whole: Array
+    white: Array
+
+    @staticmethod
+    def of(reflection: Reflection, functions: Indices) -> _Fit:
+        wide = (LAMP_ORDER + 1) ** 2
+        times_cosine = cosine_product(LAMP_ORDER)
+        fitted = np.moveaxis(outgoing_matrix(reflection, functions)[:, :wide], 2, 1)
+        wide_gram = hemisphere.gram_matrix(np.arange(wide))
+        gram = multiply(multiply(times_cosine, wide_gram), np.ascontiguousarray(times_cosine.T))
+        values, vectors = symmetric_eigenpairs(gram)
+        kept = values >= SMALLEST * values[0]
+        inverse = multiply(vectors[:, kept] / values[kept], np.ascontiguousarray(vectors[:, kept].T))
+        flat = np.ascontiguousarray(fitted).reshape(-1, wide)
+        plain = multiply(multiply(flat, np.ascontiguousarray(times_cosine.T)), inverse)
+        # y_0 is constant: the integral against it, over that of the lamps' own functions.
+        white = np.sum(times_cosine * wide_gram[0], axis=1)
+        return _Fit(plain.reshape(*fitted.shape[:2], -1), fitted[:, :, 0], white)
+
+    def kernel(self, strength: float) -> Array:
+        """(rows, n^2, channels) under a heat kernel of this strength. Lamps all around are a white world: as for K, the
+        smallest change that returns its light exactly is of rank one."""
+        kernel = self.plain * expand_bands(spherical_harmonics.window(LAMP_ORDER, "heat", strength))
+        missing = self.whole - np.sum(kernel * self.white, axis=2)
+        kernel += missing[:, :, None] * (self.white / np.sum(self.white ** 2))
+        return np.ascontiguousarray(np.moveaxis(math.pi * kernel, 1, 2))
 
 
 def cosine_product(order: int) -> Array:
