@@ -61,10 +61,10 @@ def until_encoding(scene, **options):
     return bake
 
 
-def room_with_ball(cells=16):
+def room_with_ball(cells=16, material=METAL, albedo=0.0):
     """A grey room 4 m wide, whose walls are finely divided, and a white metal ball near a corner of the floor."""
     room = box("room", (-2, -2, -2), (2, 2, 2), inward=True, albedo=(WALLS,) * 3)
-    ball = replace(sphere("ball", 0.5, (0.7, 0.4, -1.0), 3, albedo=(0, 0, 0)), materials=(METAL,))
+    ball = replace(sphere("ball", 0.5, (0.7, 0.4, -1.0), 3, albedo=(albedo,) * 3), materials=(material,))
     return SceneMesh.assemble([room, ball], 4.0 / cells / np.sqrt(48.0))
 
 
@@ -151,16 +151,40 @@ def test_bounced_highlights_hardly_ring(lit_room):
     assert seen.min() > 0.0
 
 
+def rows_of_even_light(bake, radiances):
+    """Rows of the highlights where all surfaces send out the same."""
+    points = bake.kept.points
+    highlights = LitHighlights(points, bake.visibility.rows, bake._glossy_surfaces(points), bake.visibility.blocked)
+    even = np.tile(np.float32(radiances)[None, :, None], (len(bake.gathered.receivers), 1, 1))
+    source = DiffuseRadiance(bake.gathered.hits, bake.scene, bake.gathered.receivers, even)
+    light = IndirectLight(bake.gathered.hits, source, highlights.places, highlights.blocked)
+    return drain(reflected_light(bake.tracer, highlights.surfaces, len(radiances), light))
+
+
+@pytest.mark.parametrize("lighting", ["local", "environment,local"])
+def test_white_plastic_keeps_the_energy_of_local_light(lighting):
+    """In even light the diffuse row, dimmed by the layer above, and the highlight's rows make up a white surface."""
+    plastic = SurfaceMaterial("plastic", (1.0, 1.0, 1.0), roughness=0.5, specular_level=0.5)
+    bake = until_encoding(room_with_ball(4, plastic, 1.0), cloud_lights=2, glossy_albedo=0, lighting=lighting, order=2,
+                          error_receivers=0)
+    target = next(o for o in bake.scene.objects if o.name == "ball")
+    local = replace(bake.kept, transfer=np.ones((len(bake.scene.points), 2, 1), np.float32),
+                    rows=rows_of_even_light(bake, [1.0, 1.0]))
+    count, functions = target.points.stop - target.points.start, tuple(bake.surfaces.functions)
+    signal = np.zeros((count, 1 + len(functions), 2, 1), np.float32)
+    bake._write_local(signal, target, local)
+    assert 0.8 < signal[0, 0, 0, 0] < 0.98
+    for degrees in (0.0, 30.0, 60.0):
+        view = np.array([[np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))]])
+        seen = signal[:, 0, :, 0] + np.sum(hemisphere_values(functions, view)[:, :, None] * signal[:, 1:, :, 0], axis=1)
+        np.testing.assert_allclose(seen, 1.0, atol=0.02)
+
+
 def test_a_white_metal_ball_vanishes_in_a_room_of_even_light(lit_room):
     """Three columns, no square of an order: of radiance 1, 2 and 3 on all surfaces."""
     bake = lit_room
     points = bake.kept.points
-    highlights = LitHighlights(points, bake.visibility.rows, bake._glossy_surfaces(points), bake.visibility.blocked)
-    even = np.tile(np.float32([1.0, 2.0, 3.0])[None, :, None], (len(bake.gathered.receivers), 1, 1))
-    source = DiffuseRadiance(bake.gathered.hits, bake.scene, bake.gathered.receivers, even)
-    light = IndirectLight(bake.gathered.hits, source, highlights.places, highlights.blocked)
-    steps = reflected_light(bake.tracer, highlights.surfaces, 3, light)
-    rows = drain(steps)
+    rows = rows_of_even_light(bake, [1.0, 2.0, 3.0])
     assert rows.shape == (len(points), len(bake.surfaces.functions), 3, 1)
     for degrees in (0.0, 40.0, 60.0):
         local, _ = views_of(bake, np.radians(degrees))
