@@ -16,6 +16,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
 from ..prt_addon.baking.local_lights import fit_to_lamps
@@ -31,6 +32,7 @@ from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
 from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import BadScene, StorageError
+from ..prt_addon.lighting.light_cloud import free_space
 from ..prt_addon.reporting.headline import PARTS, headline
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
@@ -124,7 +126,7 @@ class BakeSession:
         geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
         folder = jobs_folder()
         _drop_forgotten(folder)
-        regions = light_regions(depsgraph, settings.cloud_region) if settings.local_light else None
+        regions = _regions(depsgraph, settings, scene) if settings.local_light else None
         job = jobs.write_job(folder, scene, settings, reference_light(depsgraph), geometry, regions)
         process = BakeProcess([sys.executable, *bpy.app.python_args], job)
         process.start()
@@ -153,6 +155,14 @@ class BakeSession:
     def discard(self) -> None:
         """Drop the job folder."""
         jobs.discard(self.job)
+
+
+def _regions(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, scene: SceneMesh) -> NDArray[np.float64]:
+    """Where lamps will move: the region that is named, else the scene's free space, with the lamps that are there."""
+    if settings.cloud_region:
+        return light_regions(depsgraph, settings.cloud_region)
+    lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
+    return free_space(scene.points[np.unique(scene.triangles)], lamps)[None]
 
 
 def _check_storable(targets: list[bpy.types.Object]) -> None:

@@ -29,6 +29,9 @@ CLEARANCE = 0.25
 FLATTEST = 0.1
 # A side of s spacings has floor(s + this) cells: not the same on all axes, so that a cube can have 6 x 6 x 5 lights.
 ROUNDING = np.array([0.5, 0.6, 0.4])
+# How far the default region reaches beyond lamps near its border or outside, as a fraction of the scene's diagonal:
+# they are there to be moved.
+REACH = 0.05
 # Steps of the search for the spacing that gives a wanted number of lights.
 STEPS = 12
 
@@ -106,9 +109,20 @@ def box_matrix(low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
     return matrix
 
 
-def free_space(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The default region: the box (4, 4) around a scene's points (p, 3), made thicker where it is flat."""
+def free_space(points: NDArray[np.float64], lamps: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """The default region: the box (4, 4) around a scene's points (p, 3), made thicker where it is flat.
+
+    lamps: (n, 3) positions that it shall reach to and beyond by REACH of its size; those farther away than the scene is
+    wide would thin the cloud out and are left outside.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
+    if lamps is not None and len(lamps):
+        size = np.sqrt(np.sum((high - low) ** 2))
+        margin = REACH * size
+        near = lamps[((lamps > low - size) & (lamps < high + size)).all(axis=1)]
+        inside = ((near > low + margin) & (near < high - margin)).all(axis=1)
+        for lamp in near[~inside]:
+            low, high = np.minimum(low, lamp - margin), np.maximum(high, lamp + margin)
     missing = 0.5 * np.maximum(FLATTEST * (high - low).max() - (high - low), 0.0)
     return box_matrix(low - missing, high + missing)
 

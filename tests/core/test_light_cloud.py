@@ -383,3 +383,11 @@ def test_lamps_fade_for_themselves_and_are_forgotten():
     for place in places:
         step = instant.step(0.01, ["a"], place[None])
         assert np.allclose(step.weights, interpolator.weights(place).weights, atol=1e-6)
+
+
+def test_the_default_region_reaches_beyond_the_lamps():
+    points = np.array([[0.0, 0.0, 0.0], [2.0, 2.0, 1.0]])
+    plain, above = free_space(points), free_space(points, np.array([[1.0, 1.0, 1.4], [1.0, 1.0, 0.5], [900.0, 0, 0]]))
+    assert np.allclose(plain[:3, 3] + plain[:3, :3].sum(axis=1), (2.0, 2.0, 1.0))
+    assert np.allclose(above[:3, 3] + above[:3, :3].sum(axis=1), (2.0, 2.0, 1.4 + 0.05 * 3.0))
+    assert np.allclose(above[:3, 3] - above[:3, :3].sum(axis=1), 0.0)
