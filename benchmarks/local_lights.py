@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the bake's process; before numpy loads
 
@@ -38,6 +38,7 @@ from prt_addon.relighting.scene_light import joined_light
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.storage.container import BakedTransfer
 from prt_addon.tracing.tracer import Tracer
+from prt_addon.transport.buried import past_buried
 from prt_addon.transport.local_lights import LightSolver
 from tests.blender.cycles import use_cycles, vertex_radiance
 
@@ -64,7 +65,8 @@ class _KeepingBake(_Bake):
     """A bake that keeps its operator."""
 
     def _local(self, gathered, visibility):  # noqa: ANN001, ANN202
-        self.kept_gather = gathered
+        matrix = past_buried(gathered.matrix, gathered.receivers.key, self.scene, self.buried)
+        self.kept_gather = replace(gathered, matrix=matrix)
         self.kept_local = yield from super()._local(gathered, visibility)
         return self.kept_local
 
