@@ -2,8 +2,8 @@
 """The error budget of local lights: bounced light of a lamp at places that no light of the cloud has, at random
 receivers, against independent paths.
 
-sampling: our solution at the very place (rays of the gather operator, vertices); cloud: what interpolation between the
-cloud's lights and merging add; compression: clustered PCA; total: what is drawn.
+sampling: our solution at the very place (rays of the gather operator, vertices); basis: what the cloud as a basis of
+light adds, interpolation between its lights and merging; compression: clustered PCA; total: what is drawn.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
                  cloud: LightCloud, zone: NDArray[np.int32], probes: Probes, transfer: NDArray[np.float64],
                  compressed: NDArray[np.float64], bounces: int, paths: int, seed: int,
                  ) -> Generator[float, None, dict[str, Any]]:
-    """Yield progress, return {"sampling", "cloud", "compression", "total"}: each as in `error_budget`, over receivers,
+    """Yield progress, return {"sampling", "basis", "compression", "total"}: each as in `error_budget`, over receivers,
     places and channels.
 
     keys: (k,) of receivers; zone: (k,) theirs; transfer, compressed: (k, columns, channels) before and after.
@@ -83,6 +83,6 @@ def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
         return summary(np.sum(squared * alike, axis=(1, 2)), power, reference_rays, seed)
 
     return {"sampling": entry((solved - first) * (solved - second), rays),
-            "cloud": entry((interpolated - solved) ** 2, 0),
+            "basis": entry((interpolated - solved) ** 2, 0),
             "compression": entry((drawn - interpolated) ** 2, 0),
             "total": entry((drawn - first) * (drawn - second), rays)}

@@ -118,8 +118,10 @@ def _times(report: Report) -> str:
 def _errors(report: Report) -> str:
     """The error budgets: plots with intervals and what to do about each part, objects, and what is not in them."""
     parts = []
-    for title, key, words in (("Diffuse light", "errors", wording.ERRORS),
-                              ("Highlights", "highlight_errors", wording.HIGHLIGHT_ERRORS)):
+    of_lamps = ("Bounced light of lamps", wording.LOCAL_ERRORS)
+    diffuse = of_lamps if report["settings"].get("lighting") == "local" else ("Diffuse light", wording.ERRORS)
+    for (title, words), key in ((diffuse, "errors"), (("Highlights", wording.HIGHLIGHT_ERRORS), "highlight_errors"),
+                                (of_lamps, "local_errors")):
         if report.get(key):
             parts += [f"<h3>{title}</h3>", *_budget(report[key], words, title)]
     if not parts:

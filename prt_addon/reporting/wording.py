@@ -28,6 +28,17 @@ ERRORS = {
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
 }
 
+# The same for the bounced light of lamps.
+LOCAL_ERRORS = {
+    "total": ("All together", "the light of a lamp between the cloud's lights, after at least one bounce, against a "
+              "full simulation", ""),
+    "sampling": ("Ray sampling", "a limited number of rays, and the mesh's vertices, carry light from surface to "
+                 "surface", "more gather_directions, or a smaller spacing"),
+    "basis": ("Light cloud", "a lamp is put together from the lights of the cloud around it", "more cloud_lights, a "
+              "lower merge_response, or a smaller region"),
+    "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
+}
+
 # The same for highlights.
 HIGHLIGHT_ERRORS = {
     "total": ("All together", "the highlights that the preview shows, against a full simulation with the materials' "

@@ -105,6 +105,20 @@ def moved(baked: Path, name: str, **changes: object) -> Path:
     return copy
 
 
+def test_the_measured_error_is_told(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for lighting in ("local", "environment,local"):
+        scene, report, page = make_room(folder / "told.blend", sky=True), folder / "told.json", folder / "told.html"
+        assert run("bake", "--input", scene, "--output", folder / "told_baked.blend", "--lighting", lighting,
+                   "--report", report, *FAST, "--set", "error_receivers=8", "--set", "error_paths=512",
+                   "--set", "cloud_lights=27") == 0
+        assert "bounced light of lamps" in capfd.readouterr().err
+        told = json.loads(report.read_text())
+        key = "errors" if lighting == "local" else "local_errors"
+        assert set(told[key]) == set(told["errors"]) == {"sampling", "basis", "compression", "total"}
+        assert run("report", "--input", report, "--output", page) == 0
+        assert "Bounced light of lamps" in page.read_text() and "Light cloud" in page.read_text()
+
+
 def test_report_and_header_tell_of_the_cloud(baked: Path, folder: Path) -> None:
     report = json.loads((folder / "report.json").read_text())
     local = report["local"]

@@ -59,7 +59,7 @@ def indirect(container, tracer, *lamps):
 def test_error_budget_and_facts(baked):
     report = baked.report
     errors = report["errors"]
-    assert set(errors) == {"sampling", "cloud", "compression", "total"}
+    assert set(errors) == {"sampling", "basis", "compression", "total"}
     assert errors["total"]["relative_rms"] < 0.08 and errors["compression"]["relative_rms"] < 0.02
     assert errors["sampling"]["relative_rms"] < 0.05 and "bounced light of lamps" in report["headline"]
     local = report["local"]
