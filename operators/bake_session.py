@@ -185,11 +185,13 @@ def baked_message(result: BakeResult, seconds: float) -> str:
     names, report = list(result.objects), result.report
     what = names[0] if len(names) == 1 else f"{len(names)} objects"
     text = f"Baked {what} in {seconds:.1f} s, {plural(report['clusters']['count'], 'cluster', 'clusters')}"
-    if report["errors"] or report["highlight_errors"]:
+    if any(report.get(key) for key in PARTS.values()):
         text += f". {headline(report)}"
     for part, key in PARTS.items():
-        errors = {name: entry["relative_rms"] for name, entry in report[key].items()}
+        errors = {name: entry["relative_rms"] for name, entry in (report.get(key) or {}).items()}
         if errors.get("basis", 0.0) > 0.5 * errors.get("total", 0.0):
+            if key == "local_errors" or report["settings"]["lighting"] == "local":
+                return f"{text}, mostly because the light cloud has few lights"
             subject = "" if part == "diffuse" else ", in highlights"
             return f"{text}, mostly because the light is sharper than the order can show{subject}"
     return text

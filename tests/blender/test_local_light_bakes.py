@@ -200,3 +200,16 @@ def test_a_wrong_region_is_refused_in_one_line(folder: Path, region: str, words:
                f"cloud_region={region}", *FAST) == 1
     line = capfd.readouterr().err.strip().splitlines()[-1]
     assert region in line and words in line and not (folder / "none.blend").exists()
+
+
+@pytest.mark.parametrize("lighting, key, basis, words", [
+    ("environment", "errors", 0.01, "(diffuse)"), ("environment", "errors", 0.09, "sharper than the order"),
+    ("local", "errors", 0.09, "few lights"), ("environment,local", "local_errors", 0.09, "few lights")])
+def test_the_message_after_a_bake_knows_what_was_measured(lighting: str, key: str, basis: float, words: str) -> None:
+    from prt.operators.bake_session import baked_message
+
+    errors = {"basis": {"relative_rms": basis}, "total": {"relative_rms": 0.1}}
+    report = {"clusters": {"count": 3}, "settings": {"lighting": lighting}, "errors": {}, "highlight_errors": {},
+              key: errors}
+    message = baked_message(types.SimpleNamespace(objects={"Cube": None}, report=report), 1.5)
+    assert message.startswith("Baked Cube in 1.5 s, 3 clusters. Total error 10 %") and words in message
