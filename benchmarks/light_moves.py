@@ -59,7 +59,7 @@ def main() -> None:
     settings = make_settings("standard", {"lighting": "local", "cloud_lights": str(arguments.lights), "cloud_emission":
                                           "1", "gather_directions": "64", "error_receivers": "0"})
     baked = drain(bake(scene, settings, regions=np.array([box_matrix(*box)]))).objects[thing.name]
-    tracer = Tracer(scene.points, scene.triangles)
+    tracer = Tracer(scene.points, scene.triangles, threads=1)  # as in Blender's own process
     package = types.ModuleType("prt")  # gpu_shaders imports the core relatively, as in the installed extension
     package.__path__ = [str(ROOT)]
     sys.modules["prt"] = package

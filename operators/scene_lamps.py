@@ -51,7 +51,8 @@ class SceneLamps:
         lamps = read_local_lights(depsgraph, warnings)
         if self._tracer is None:
             scene = SceneMesh.assemble(read_objects(depsgraph, list(near), []), 0.0)
-            self._tracer = Tracer(scene.points, scene.triangles)
+            # In Blender's own process nothing starts threads (design/architecture.md).
+            self._tracer = Tracer(scene.points, scene.triangles, threads=1)
         self._lit = {}
         for transfer in near.values():
             key = _cloud_key(transfer)

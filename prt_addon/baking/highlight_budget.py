@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..basis import hemisphere
-from ..basis.directions import tangent_frames
+from ..basis.directions import disc_directions, tangent_frames
 from ..basis.hemisphere import Indices
 from ..basis.spherical_harmonics import evaluate, order_of
 from ..lighting.reference_light import ReferenceLight
@@ -39,7 +39,6 @@ from .highlight_reference import ALL_HITS, TrueSurfaces, arriving_radiance
 from .highlight_sampling import (
     TrueHighlight,
     cosine_directions,
-    disc_directions,
     even_directions,
     lattice,
     to_local,

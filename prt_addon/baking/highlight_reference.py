@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..basis.directions import tangent_frames
-from ..scene.receivers import LIFT
+from ..basis.directions import disc_directions, tangent_frames
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Hits, Tracer
 from ..transport.glossy import surface_frames
-from ..transport.path_reference import HIT_LIFT, SURE_BOUNCES, DistantSuns, Emission
-from .highlight_sampling import TrueHighlight, above_horizon, cosine_directions, disc_directions, to_local, to_world
+from ..transport.path_reference import SURE_BOUNCES, DistantSuns, Emission, surface_at
+from .highlight_sampling import TrueHighlight, above_horizon, cosine_directions, to_local, to_world
 from .surfaces import SurfacePlan
 
 Array = NDArray[np.float64]
@@ -133,22 +132,11 @@ def _add(total: Array, path: NDArray[np.int64], values: Array) -> None:
 
 def _met(surfaces: TrueSurfaces, rays: _Rays, hits: Hits, met: NDArray[np.int64]) -> _Met:
     scene = surfaces.scene
-    corner = scene.triangles[hits.triangle[met]]
-    u, v = hits.u[met].astype(np.float64), hits.v[met].astype(np.float64)
-    weights = np.stack([1.0 - u - v, u, v], axis=1)[:, :, None]
-    places = scene.points[corner]
-    face = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
-    face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
-    side = np.where(hits.front[met], 1.0, -1.0)[:, None]
-    normal = np.sum(weights * scene.normals[corner], axis=1)
-    normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), 1e-12)
-    frames = surface_frames(side * normal, np.sum(weights * scene.tangents[corner], axis=1))
-    origin = np.sum(weights * places, axis=1) + side * face * (HIT_LIFT * LIFT * surfaces.tracer.diagonal)
-    return _Met(surfaces.tracer.to_tracing_space(origin), side * face, frames,
-                above_horizon(to_local(-rays.directions.astype(np.float64), frames)),
-                np.sum(weights * surfaces.even[corner].astype(np.float64), axis=1),
-                np.sum(weights * scene.albedo[corner].astype(np.float64), axis=1),
-                scene.material[corner[:, 0]].astype(np.int64), side[:, 0])
+    found = surface_at(surfaces.tracer, scene, hits, met)
+    frames = surface_frames(found.normals, found.mean(scene.tangents))
+    seen_from = above_horizon(to_local(-rays.directions.astype(np.float64), frames))
+    return _Met(found.origins, found.faces, frames, seen_from, found.mean(surfaces.even), found.mean(scene.albedo),
+                scene.material[found.corner[:, 0]].astype(np.int64), found.side)
 
 
 def _shiny(surfaces: TrueSurfaces, place: _Met, depth: int, glossy: int) -> dict[int, NDArray[np.int64]]:

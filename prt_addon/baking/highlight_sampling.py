@@ -121,16 +121,6 @@ def even_directions(numbers: Array) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
 
-def disc_directions(frame: Array, angle: float, numbers: Array) -> tuple[Array, float]:
-    """Directions (n, 3) even over a disc of full angle (radians) about the last row of a frame (3, 3), and its solid
-    angle over its projected one (1 for a point)."""
-    half = 0.5 * angle
-    drop = 2.0 * np.sin(0.5 * half) ** 2 * numbers[:, 0]  # 1 - cos, without cancellation for the real sun
-    radius, turn = np.sqrt(drop * (2.0 - drop)), 2.0 * np.pi * numbers[:, 1]
-    local = np.stack([radius * np.cos(turn), radius * np.sin(turn), 1.0 - drop], axis=1)
-    return to_world(local, frame[None]), 1.0 / np.cos(0.5 * half) ** 2
-
-
 def to_world(local: Array, frames: Array) -> Array:
     """Local directions (n, 3) of frames (n, 3, 3), rows tangent, bitangent, normal."""
     return np.sum(local[:, :, None] * frames, axis=1)

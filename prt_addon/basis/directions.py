@@ -133,3 +133,14 @@ def tangent_frames(normals: ArrayLike) -> Array:
     tangent = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
     bitangent = np.stack([b, sign + y * y * a, -y], axis=1)
     return np.stack([tangent, bitangent, normals], axis=1)
+
+
+def disc_directions(frame: NDArray[np.float64], angle: float, numbers: NDArray[np.float64],
+                    ) -> tuple[NDArray[np.float64], float]:
+    """Directions (n, 3) even over a disc of full angle (radians) about the last row of a frame (3, 3), from numbers
+    (n, 2) in [0, 1), and the disc's solid angle over its projected one (1 for a point)."""
+    half = 0.5 * angle
+    drop = 2.0 * np.sin(0.5 * half) ** 2 * numbers[:, 0]  # 1 - cos, without cancellation for the real sun
+    radius, turn = np.sqrt(drop * (2.0 - drop)), 2.0 * np.pi * numbers[:, 1]
+    local = np.stack([radius * np.cos(turn), radius * np.sin(turn), 1.0 - drop], axis=1)
+    return np.sum(local[:, :, None] * frame[None], axis=1), float(1.0 / np.cos(0.5 * half) ** 2)

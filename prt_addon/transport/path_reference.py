@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..basis.directions import tangent_frames
+from ..basis.directions import disc_directions, tangent_frames
 from ..scene.receivers import LIFT
 from ..scene.scene_mesh import SceneMesh
-from ..tracing.tracer import Tracer
+from ..tracing.tracer import Hits, Tracer
 from .receiver_set import ReceiverSet
 
 # After this many bounces a path goes on with the probability of its albedo (Russian roulette).
@@ -157,7 +157,8 @@ def _add_suns(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths
     """Add each sun's reflected light at the paths' surfaces to the last emission value; return the rays traced."""
     rays = 0
     for direction, irradiance, angle in zip(suns.directions, suns.irradiance, suns.angles, strict=True):
-        towards, scale = _disc_directions(direction, float(angle), len(paths.owner), generator)
+        frame = tangent_frames(direction[None, :])[0]
+        towards, scale = disc_directions(frame, float(angle), generator.random((len(paths.owner), 2)))
         cosine = np.sum(paths.normals * towards, axis=1)
         if paths.faces is None:
             cosine *= receivers.above_faces(paths.owner + part.start, towards)
@@ -187,23 +188,26 @@ def _add_points(tracer: Tracer, paths: _Paths, lights: PointLights, total: NDArr
     return rays
 
 
-def _disc_directions(direction: NDArray[np.float64], angle: float, count: int, generator: np.random.Generator,
-                     ) -> tuple[NDArray[np.float64], float]:
-    """Directions (count, 3) even over a sun's disc, and solid angle over projected solid angle (1 for a point)."""
-    half = 0.5 * angle
-    numbers = generator.random((count, 2))
-    drop = 2.0 * np.sin(0.5 * half) ** 2 * numbers[:, 0]  # 1 - cos, without cancellation for the real sun
-    radius, turn = np.sqrt(drop * (2.0 - drop)), 2.0 * np.pi * numbers[:, 1]
-    local = np.stack([radius * np.cos(turn), radius * np.sin(turn), 1.0 - drop], axis=1)
-    frame = tangent_frames(direction[None, :])[0]
-    scale = 4.0 * np.sin(0.5 * half) ** 2 / np.sin(half) ** 2 if half > 1e-6 else 1.0
-    return np.sum(local[:, :, None] * frame[None], axis=1), scale
+@dataclass(frozen=True)
+class HitSurface:
+    """The surface at n hits, on the side that was hit. corner: (n, 3) points of the scene; weights: (n, 3, 1)
+    barycentric; origins: (n, 3) in tracing space, from which rays go on; normals: (n, 3) shading normals; faces: (n, 3)
+    normals of the faces; side: (n,) 1 for the front, -1 for the back."""
+
+    corner: NDArray[np.int32]
+    weights: NDArray[np.float64]
+    origins: NDArray[np.float32]
+    normals: NDArray[np.float64]
+    faces: NDArray[np.float64]
+    side: NDArray[np.float64]
+
+    def mean(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Values of the scene's points (points, k) at the hits."""
+        return np.sum(self.weights * values[self.corner].astype(np.float64), axis=1)
 
 
-def _next(tracer: Tracer, scene: SceneMesh, paths: _Paths, directions: NDArray[np.float32], hits,  # noqa: ANN001
-          albedo: NDArray[np.float32]) -> _Paths:
-    """The paths that hit something, reflected: at the hit, on the side that was hit, dimmed by its albedo."""
-    met = np.flatnonzero(hits.triangle >= 0)
+def surface_at(tracer: Tracer, scene: SceneMesh, hits: Hits, met: NDArray[np.int64]) -> HitSurface:
+    """The surface at the hits numbered `met`."""
     corner = scene.triangles[hits.triangle[met]]
     u, v = hits.u[met].astype(np.float64), hits.v[met].astype(np.float64)
     weights = np.stack([1.0 - u - v, u, v], axis=1)[:, :, None]
@@ -214,8 +218,16 @@ def _next(tracer: Tracer, scene: SceneMesh, paths: _Paths, directions: NDArray[n
     normal = np.sum(weights * scene.normals[corner], axis=1)
     normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), 1e-12)
     origin = np.sum(weights * places, axis=1) + side * face * (HIT_LIFT * LIFT * tracer.diagonal)
-    dimmed = paths.throughput[met] * np.sum(weights * albedo[corner].astype(np.float64), axis=1)
-    return _Paths(paths.owner[met], tracer.to_tracing_space(origin), side * normal, dimmed, side * face)
+    return HitSurface(corner, weights, tracer.to_tracing_space(origin), side * normal, side * face, side[:, 0])
+
+
+def _next(tracer: Tracer, scene: SceneMesh, paths: _Paths, directions: NDArray[np.float32], hits: Hits,
+          albedo: NDArray[np.float32]) -> _Paths:
+    """The paths that hit something, reflected: at the hit, on the side that was hit, dimmed by its albedo."""
+    met = np.flatnonzero(hits.triangle >= 0)
+    found = surface_at(tracer, scene, hits, met)
+    return _Paths(paths.owner[met], found.origins, found.normals, paths.throughput[met] * found.mean(albedo),
+                  found.faces)
 
 
 def _roulette(paths: _Paths, generator: np.random.Generator) -> _Paths:
