@@ -7,6 +7,7 @@ they go to disk as they are made, one file per zone, and one zone at a time come
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
@@ -38,6 +39,8 @@ from .settings import BakeSettings
 
 # Parts of the progress that end with: the first solutions, merging (the rest: solutions at the merged places).
 SOLVED, MERGED, PROBED = 0.6, 0.7, 0.95
+# Name of the folder of responses on disk begins so.
+RESPONSES = "responses-"
 # Order of directional emission where the scene has lamps that need one: it costs four times an isotropic cloud, and
 # tells a spot's light before it from that behind it.
 ORDER_OF_SPOTS = 2
@@ -116,7 +119,9 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
                          settings.cloud_radius)
     solved, merging = (SOLVED, MERGED) if highlights is None else (0.5 * SOLVED, 0.5 * MERGED)
     values = order ** 2 * albedo.shape[1]
-    with tempfile.TemporaryDirectory(dir=folder, prefix="responses-") as place:
+    for left in folder.glob(f"{RESPONSES}*") if folder else ():  # by a bake of this job that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=RESPONSES) as place:
         store = _Responses(Path(place), members, gathered, len(lights), values)
         yield from _part(solver.solve(lights.positions, store.take), 0.0, solved)
         found = []

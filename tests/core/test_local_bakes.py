@@ -163,6 +163,8 @@ def test_a_job_resumes_and_its_result_is_the_same(tmp_path):
     settings = BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0, "cloud_lights": 27})
     regions = np.array([box_matrix((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))])
     folder = write_job(tmp_path, room(), settings, regions=regions)
+    (folder / "responses-killed").mkdir()  # as a bake that was killed leaves it
+    (folder / "responses-killed" / "zone_0.npy").write_bytes(b"much")
     steps = run_job(folder)
     for progress in steps:
         if progress.stage == "encode":
