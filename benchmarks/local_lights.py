@@ -71,9 +71,11 @@ class _KeepingBake(_Bake):
         return self.kept_local
 
 
-def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSettings, spacing: float = 0.0) -> Kept:
-    """Bake the object's vertices as they are."""
-    scene = SceneMesh.assemble(read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name], []), spacing)
+def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSettings, spacing: float = 0.0,
+          inside: NDArray[np.float64] | None = None) -> Kept:
+    """Bake the object's vertices as they are. inside: places (n, 3) in rooms that are closed all round."""
+    objects = read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name], [])
+    scene = SceneMesh.assemble(objects, spacing, inside)
     started = time.perf_counter()
     bake = _KeepingBake(scene, transport_settings(settings), None, None, {}, np.array([box_matrix(*box)]))
     result = drain(bake.run())
