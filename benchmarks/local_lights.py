@@ -2,28 +2,34 @@
 """Local light clouds in the scenes of Kristensen et al. 2005, beside their Table 1 and against Cycles. Needs the bpy
 wheel.
 
-    python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze] [--positions 20] [--samples 256] [--set ...]
+    python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze,dense] [--positions 20] [--samples 64] [--docs]
+                                      [--set NAME=VALUE ...]
 
-Light moves to held-back random positions; indirect light there is compared with Cycles' own vertex bake of indirect
-light, as a relative RMS over vertices and channels, of which the mean square over positions is taken (so that no
-position counts more for being near a surface, where all is brighter). Cycles is baked twice with other seeds; the mean
-of (ours - a)(ours - b) is the squared error without Cycles' own noise. Columns: `solver`, our solution at the very
-position (rays of the operator); `cloud`, what interpolation and merging add to it; `compression`; all of it.
+A lamp moves to held-back random places, half a spacing of the cloud or more from surfaces; indirect light there is
+compared with Cycles' own vertex bake of indirect light (of the glossy bunny: what it sends of it to a camera), as a
+relative RMS over vertices and channels, of which the mean square over places is taken. Cycles is baked twice with other
+seeds; the mean of (ours - a)(ours - b) is the squared error without Cycles' own noise, which is a column of its own
+(of one bake). Columns: `solver`, our solution at the very place (rays of the operator); `cloud`, what interpolation and
+merging add to it; `compression`; `all` of it; `open`, of places a whole spacing from surfaces. `move ms`: weights and
+constants of the clusters; `frame ms`: with direct light and every vertex on the processor, one thread, nothing drawn.
+`dense`: the Cornell box under more lights, merging less.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the bake's process; before numpy loads
 
 import bpy
 import local_scenes
 import numpy as np
-from common import drain, print_table
+from common import ROOT, best_of, drain, markdown_table, write_block
 from numpy.typing import NDArray
 
 from prt_addon.baking.recipe import _Bake, transport_settings
@@ -32,8 +38,15 @@ from prt_addon.blender.read_scene import read_objects
 from prt_addon.lighting.light_cloud import box_matrix
 from prt_addon.lighting.light_visibility import surroundings
 from prt_addon.lighting.local_lights import LocalLight
-from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
-from prt_addon.relighting.lamp_light import LampLight
+from prt_addon.linear_algebra import multiply
+from prt_addon.relighting.exit_radiance import (
+    cluster_constants,
+    combine_rows,
+    exit_radiance,
+    hemisphere_values,
+    local_views,
+)
+from prt_addon.relighting.lamp_light import DirectLight, LampLight
 from prt_addon.relighting.scene_light import joined_light
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.storage.container import BakedTransfer
@@ -42,9 +55,19 @@ from prt_addon.transport.buried import past_buried
 from prt_addon.transport.local_lights import LightSolver
 from tests.blender.cycles import use_cycles, vertex_radiance
 
-PAPER = {"cornell": "4k, 8 zones, 216 -> 53, 30 clusters x 12, 58 fps", "hole": "5k, 10, 250 -> 49, 18 x 12, 55 fps",
-         "bunny": "11k, 11, 125, 22 x 16, 7 fps", "maze": "43k, 16, 1024 -> 128, 191 x 16, 7 fps"}
-LIGHTS = {"cornell": 216, "hole": 250, "bunny": 125, "maze": 1024}
+# Table 1: triangles, zones, lights, merged lights, clusters, vectors, hours of light transport + compression, fps.
+PAPER = {"cornell": ["4k", 8, 216, 53, 30, 12, "2 + 1 h", 58], "hole": ["5k", 10, 250, 49, 18, 12, "3 + 2 h", 55],
+         "bunny": ["11k", 11, 125, 125, 22, 16, "6 h", 7], "maze": ["43k", 16, 1024, 128, 191, 16, "6 + 3 h", 7]}
+# Lights as the paper's; receivers of a zone such that there are about as many zones.
+SETTINGS = {"cornell": {"cloud_lights": "216", "zone_receivers": "400"},
+            "hole": {"cloud_lights": "250", "zone_receivers": "400"},
+            "bunny": {"cloud_lights": "125", "zone_receivers": "1200", "glossy_rows": "16"},
+            "maze": {"cloud_lights": "1024", "zone_receivers": "2000", "clusters": "192"},
+            "dense": {"cloud_lights": "512", "zone_receivers": "400", "merge_response": "0.02"}}
+ALL_SCENES = {"lighting": "local", "cloud_emission": "1", "clusters": "64", "vectors": "12", "encoder": "adaptive",
+              "gather_directions": "2048", "error_receivers": "0"}
+# Indirect light that a camera sees.
+SEEN = {"INDIRECT", "DIFFUSE", "GLOSSY"}
 POWER = 4.0 * np.pi  # watts of a Point light of 1 W/sr
 
 
@@ -55,7 +78,7 @@ class Kept:
     baked: BakedTransfer
     solver: LightSolver
     scene: SceneMesh
-    transfer: NDArray[np.float32]
+    transfer: NDArray[np.float32]  # (points, rows, columns, channels)
     report: dict
     seconds: float
     visible: NDArray[np.int64]  # receivers of the object that do not lie inside bodies
@@ -67,8 +90,11 @@ class _KeepingBake(_Bake):
     def _local(self, gathered, visibility):  # noqa: ANN001, ANN202
         matrix = past_buried(gathered.matrix, gathered.receivers.key, self.scene, self.buried)
         self.kept_gather = replace(gathered, matrix=matrix)
-        self.kept_local = yield from super()._local(gathered, visibility)
-        return self.kept_local
+        return (yield from super()._local(gathered, visibility))
+
+    def _join_local(self, signals, local):  # noqa: ANN001, ANN202
+        super()._join_local(signals, local)
+        self.kept_signals = {name: signal / np.float32(self.local_scale) for name, signal in signals.items()}
 
 
 def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSettings, spacing: float = 0.0,
@@ -85,7 +111,7 @@ def baked(thing: bpy.types.Object, box: NDArray[np.float64], settings: BakeSetti
     solver = LightSolver(bake.tracer, scene, bake.kept_gather, albedo, 1e-4, -1)
     place = next(o.points for o in scene.objects if o.is_target)
     visible = bake.open_keys[(bake.open_keys >= place.start) & (bake.open_keys < place.stop)] - place.start
-    return Kept(next(iter(result.objects.values())), solver, scene, bake.kept_local.transfer[place], result.report,
+    return Kept(next(iter(result.objects.values())), solver, scene, bake.kept_signals[thing.name], result.report,
                 seconds, visible)
 
 
@@ -97,8 +123,8 @@ def held_back(tracer: Tracer, box: NDArray[np.float64], count: int, clearance: f
     return places[~around.inside & (around.clearance > clearance)][:count]
 
 
-def ours(kept: Kept, lamp: LampLight, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Indirect radiance (v, 3), unit albedo: solved at the very position, by the cloud, and by the compressed cloud."""
+def solved(kept: Kept, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Indirect radiance (v, 3), unit albedo, solved at the very position."""
     exact = np.zeros((len(kept.baked.cluster), 3))
     rows = np.full(len(kept.scene.points), -1)
     front = kept.solver.gathered.receivers.key < len(rows)
@@ -109,68 +135,145 @@ def ours(kept: Kept, lamp: LampLight, position: NDArray[np.float64]) -> tuple[ND
         exact[:] = response[rows[place], 0]
 
     drain(kept.solver.solve(position[None], take))
+    return exact
+
+
+def point_lamp(position: NDArray[np.float64]) -> LocalLight:
+    """An isotropic lamp of 1 W/sr."""
     matrix = np.eye(4)
     matrix[:3, 3] = position
-    light = lamp.step([LocalLight("lamp", "point", matrix, np.full(3, POWER))]).values
-    zone = kept.baked.cluster_zone[kept.baked.cluster]
-    cloud = np.einsum("pjc,pjc->pc", *np.broadcast_arrays(kept.transfer, light[zone].astype(np.float64)))
-    constants = cluster_constants(kept.baked.bases, joined_light(kept.baked.lighting_basis, None, light),
-                                  kept.baked.cluster_zone)
-    drawn = exit_radiance(kept.baked.cluster, kept.baked.weights, constants)[:, 0]
-    return exact, cloud, drawn.astype(np.float64)
+    return LocalLight("lamp", "point", matrix, np.full(3, POWER))
+
+
+def ours(kept: Kept, lamp: LampLight, position: NDArray[np.float64], views: NDArray[np.float64] | None,
+         ) -> tuple[NDArray[np.float64], ...]:
+    """Indirect radiance (v, 3) by the cloud and by the compressed cloud: for unit albedo, or towards views (v, 3)."""
+    baked = kept.baked
+    light = joined_light(baked.lighting_basis, None, lamp.step([point_lamp(position)]).values)
+    zone = baked.cluster_zone[baked.cluster]
+    channels = range(3) if kept.transfer.shape[3] == 3 else [0, 0, 0]
+    before = np.empty((*kept.transfer.shape[:2], 3), np.float32)
+    for number in np.unique(zone):
+        inside = np.flatnonzero(zone == number)
+        own = kept.transfer[inside]
+        for to, channel in enumerate(channels):
+            part = np.ascontiguousarray(own[..., channel]).reshape(-1, own.shape[2])
+            before[inside, :, to] = multiply(part, light[number][:, to:to + 1]).reshape(len(inside), -1)
+    after = exit_radiance(baked.cluster, baked.weights, cluster_constants(baked.bases, light, baked.cluster_zone))
+    if views is None:
+        return before[:, 0].astype(np.float64), after[:, 0].astype(np.float64)
+    values = hemisphere_values(baked.functions, local_views(views, baked.normals, baked.tangents))
+    return tuple(combine_rows(rows, baked.albedo, values).astype(np.float64) for rows in (before, after))
+
+
+def add_camera(kept: Kept) -> NDArray[np.float64]:
+    """A camera in front; views (v, 3) from the vertices, and which vertices face it is for the caller."""
+    place = np.array([0.9, -3.5, 1.4])
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    bpy.context.scene.collection.objects.link(camera)
+    camera.location = place
+    bpy.context.scene.camera = camera
+    bpy.context.view_layer.update()
+    return place - kept.baked.positions
+
+
+def milliseconds(kept: Kept, lamp: LampLight, places: NDArray[np.float64]) -> list[float]:
+    """Of a move of one lamp, and of a frame's light on the processor: the least of some runs, the mean over places."""
+    baked, direct = kept.baked, DirectLight(kept.solver.tracer, kept.baked)
+
+    def move(light: LocalLight) -> NDArray[np.float32]:
+        values = joined_light(baked.lighting_basis, None, lamp.step([light]).values)
+        return cluster_constants(baked.bases, values, baked.cluster_zone)
+
+    lamps = [point_lamp(place) for place in places[:5]]
+    moved = [best_of(5, lambda light=light: move(light)) for light in lamps]
+    drawn = [best_of(3, lambda c=constants: exit_radiance(baked.cluster, baked.weights, c))[0]
+             for _, constants in moved]
+    lit = [best_of(3, lambda light=light: direct.of([light]))[0] for light in lamps]
+    move_ms = 1e3 * float(np.mean([seconds for seconds, _ in moved]))
+    return [move_ms, move_ms + 1e3 * float(np.mean(drawn) + np.mean(lit))]
 
 
 def run(name: str, arguments: argparse.Namespace) -> list:
     """One scene's line of the table."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    thing, box = local_scenes.SCENES[name]()
+    thing, box = local_scenes.SCENES["cornell" if name == "dense" else name]()
     use_cycles(arguments.samples)
     bpy.context.scene.render.threads = 2
-    overrides = {"lighting": "local", "cloud_lights": str(LIGHTS[name]), "cloud_emission": "1"}
-    settings = make_settings(arguments.preset, overrides | dict(s.split("=", 1) for s in arguments.set))
-    kept = baked(thing, box, settings)
+    overrides = ALL_SCENES | SETTINGS[name] | dict(s.split("=", 1) for s in arguments.set)
+    kept = baked(thing, box, make_settings(arguments.preset, overrides))
     lamp = LampLight(kept.baked.cloud, kept.solver.tracer)
     spacing = kept.report["local"]["spacing"]
     places = held_back(kept.solver.tracer, box, arguments.positions, arguments.clearance * spacing)
+    views, passes, chosen = None, {"INDIRECT"}, kept.visible
+    if kept.baked.functions:
+        views, passes = add_camera(kept), SEEN
+        facing = np.sum(views * kept.baked.normals, axis=1) > 0.2 * np.sqrt(np.sum(views ** 2, axis=1))
+        chosen = kept.visible[facing[kept.visible]]
+    costs = milliseconds(kept, lamp, places)
     data = bpy.data.lights.new("Lamp", "POINT")
     data.energy, data.shadow_soft_size = POWER, 0.0
     source = bpy.data.objects.new("Lamp", data)
     bpy.context.scene.collection.objects.link(source)
-    sums = np.zeros((4, 2))
-    clear = surroundings(kept.solver.tracer, places).clearance
+    clear, found, started = surroundings(kept.solver.tracer, places).clearance, [], time.perf_counter()
     for position, distance in zip(places, clear, strict=True):
         source.location = position
-        solved, cloud, drawn = (light[kept.visible] for light in ours(kept, lamp, position))
-        first, second = (vertex_radiance(thing, {"INDIRECT"}, seed)[kept.visible] for seed in (0, 1))
+        cloud, drawn = (light[chosen] for light in ours(kept, lamp, position, views))
+        exact = cloud if views is not None else solved(kept, position)[chosen]
+        first, second = (vertex_radiance(thing, passes, seed)[chosen] for seed in (0, 1))
         power = np.sum(first * second)
-        found = np.array([np.sum((solved - first) * (solved - second)), np.sum((cloud - solved) ** 2),
-                          np.sum((drawn - cloud) ** 2), np.sum((drawn - first) * (drawn - second))]) / power
-        print(position.round(2), f"clear by {distance:.2f} m:", *(100.0 * np.sqrt(np.maximum(found, 0.0))).round(1),
-              flush=True)
-        sums += np.stack([found, np.ones(4)], axis=1)
-    errors = 100.0 * np.sqrt(np.maximum(sums[:, 0], 0.0) / sums[:, 1])
+        found.append(np.array([np.sum((exact - first) * (exact - second)), np.sum((cloud - exact) ** 2),
+                               np.sum((drawn - cloud) ** 2), np.sum((drawn - first) * (drawn - second)),
+                               0.5 * np.sum((first - second) ** 2)]) / power)
+        print(position.round(2), f"clear by {distance:.2f} m:", *_percent(found[-1]), flush=True)
+    errors = _percent(np.mean(found, axis=0))
+    far = clear > spacing
+    open_error = float(_percent(np.mean(np.array(found)[far], axis=0))[3]) if far.any() else float("nan")
+    print(f"{name}: Cycles took {time.perf_counter() - started:.0f} s; {far.sum()} of {len(far)} places in the open")
     local, clusters = kept.report["local"], kept.report["clusters"]
-    return [name, len(thing.data.polygons) * 2, local["zones"], local["lights"], float(np.mean(local["merged"])),
-            clusters["count"], clusters["vectors_mean"], kept.seconds, *errors, PAPER[name]]
+    triangles = sum(len(polygon.vertices) - 2 for thing in bpy.data.meshes for polygon in thing.polygons)
+    solver_cloud = errors[:2] if views is None else ["with cloud", errors[0]]
+    return [name, triangles, local["zones"], local["lights"], float(np.mean(local["merged"])), clusters["count"],
+            clusters["vectors_mean"], f"{kept.seconds:.0f} s", *costs, *solver_cloud, *errors[2:4], open_error,
+            errors[4]]
+
+
+def _percent(squares: NDArray[np.float64]) -> list[float]:
+    """Relative errors of their squares, which noise can make negative."""
+    return [round(100.0 * float(np.sqrt(max(square, 0.0))), 2) for square in squares]
+
+
+HEADER = ["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "vectors, mean", "bake", "move ms",
+          "frame ms", "solver %", "cloud %", "compression %", "all %", "open %", "Cycles' noise %"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", default="cornell,hole,bunny,maze")
+    parser.add_argument("--scenes", default="cornell,hole,bunny,maze,dense")
     parser.add_argument("--positions", type=int, default=20)
-    parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--clearance", type=float, default=0.5,
                         help="least distance of lights from surfaces, in spacings of the cloud")
     parser.add_argument("--preset", default="standard")
+    parser.add_argument("--docs", action="store_true")
+    parser.add_argument("--rows", type=Path, help="file of rows: those found here are added, all are printed")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
+    known = json.loads(arguments.rows.read_text()) if arguments.rows and arguments.rows.exists() else {}
+    for name in filter(None, arguments.scenes.split(",")):
+        known[name] = run(name, arguments)
+        if arguments.rows:
+            arguments.rows.write_text(json.dumps(known))
     rows = []
-    for name in arguments.scenes.split(","):
-        rows.append(run(name, arguments))
-        print(rows[-1], flush=True)
-    print_table(["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "vectors, mean", "bake s",
-                 "solver %", "cloud %", "compression %", "all %", "paper: triangles, zones, lights, clusters, fps"],
-                rows)
+    for name, row in known.items():
+        rows.append(row)
+        if name in PAPER:
+            *sizes, hours, rate = PAPER[name]
+            rows.append(["the paper", *sizes, hours, "", f"{1000 / rate:.0f}", *[""] * 6])
+    table = markdown_table(HEADER, rows)
+    print(table)
+    if arguments.docs:
+        write_block(ROOT / "docs" / "local_lights.md", "local scenes", table)
 
 
 if __name__ == "__main__":

@@ -123,7 +123,7 @@ ALL_LIGHT = {"DIRECT", "INDIRECT", "DIFFUSE", "GLOSSY", "TRANSMISSION", "EMIT"}
 
 def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) -> np.ndarray:
     """Exit radiance (v, 3) of an object's vertices under the scene's light, baked by Cycles: for unit albedo and of
-    diffuse light, or, with ALL_LIGHT, all of it towards the scene's camera."""
+    diffuse light, or, with the pass GLOSSY as in ALL_LIGHT, what goes towards the scene's camera, colours included."""
     mesh = thing.data
     attribute = mesh.color_attributes.get("bake") or mesh.color_attributes.new("bake", "FLOAT_COLOR", "POINT")
     mesh.color_attributes.active_color = attribute
@@ -132,8 +132,8 @@ def vertex_radiance(thing: bpy.types.Object, passes: set[str], seed: int = 0) ->
     thing.select_set(True)
     bpy.context.scene.cycles.seed = seed
     bake = bpy.context.scene.render.bake
-    bake.use_pass_color, bake.view_from = False, "ACTIVE_CAMERA" if passes == ALL_LIGHT else "ABOVE_SURFACE"
-    bpy.ops.object.bake(type="COMBINED" if passes == ALL_LIGHT else "DIFFUSE", pass_filter=passes,
+    bake.use_pass_color, bake.view_from = False, "ACTIVE_CAMERA" if "GLOSSY" in passes else "ABOVE_SURFACE"
+    bpy.ops.object.bake(type="COMBINED" if "GLOSSY" in passes else "DIFFUSE", pass_filter=passes,
                         target="VERTEX_COLORS", use_clear=True)
     colours = np.empty(4 * len(mesh.vertices), np.float32)
     mesh.color_attributes["bake"].data.foreach_get("color", colours)
