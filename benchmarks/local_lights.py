@@ -10,9 +10,9 @@ compared with Cycles' own vertex bake of indirect light (of the glossy bunny: wh
 relative RMS over vertices and channels, of which the mean square over places is taken. Cycles is baked twice with other
 seeds; the mean of (ours - a)(ours - b) is the squared error without Cycles' own noise, which is a column of its own
 (of one bake). Columns: `solver`, our solution at the very place (rays of the operator); `cloud`, what interpolation and
-merging add to it; `compression`; `all` of it; `open`, of places a whole spacing from surfaces. `move ms`: weights and
-constants of the clusters; `frame ms`: with direct light and every vertex on the processor, one thread, nothing drawn.
-`dense`: the Cornell box under more lights, merging less.
+merging add to it; `compression`; `all` of it; `open`, of places a spacing from surfaces and half of one within the
+cloud's box. `move ms`: weights and constants of the clusters; `frame ms`: with direct light and every vertex on the
+processor, one thread, nothing drawn. `dense`: the Cornell box under more lights, merging less.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ def run(name: str, arguments: argparse.Namespace) -> list:
                                0.5 * np.sum((first - second) ** 2)]) / power)
         print(position.round(2), f"clear by {distance:.2f} m:", *_percent(found[-1]), flush=True)
     errors = _percent(np.mean(found, axis=0))
-    far = clear > spacing
+    far = (clear > spacing) & (np.minimum(places - box[0], box[1] - places).min(axis=1) > 0.5 * spacing)
     open_error = float(_percent(np.mean(np.array(found)[far], axis=0))[3]) if far.any() else float("nan")
     print(f"{name}: Cycles took {time.perf_counter() - started:.0f} s; {far.sum()} of {len(far)} places in the open")
     local, clusters = kept.report["local"], kept.report["clusters"]

@@ -159,6 +159,42 @@ def test_one_light_clouds_and_sealed_rooms_without_lights():
         exhaust(bake(room(), BakeSettings(**{**LOCAL.as_dict(), "cloud_radius": 0.2}), regions=thin))
 
 
+def test_a_lamp_inside_a_solid_body_is_named_and_one_on_it_shines():
+    cube = box("cube", (0.6, 0.2, 0.1), (0.9, 0.5, 0.4), target=False)
+    meshes = [box("room", inward=True, albedo=(0.7, 0.5, 0.3)), cube]
+    scene = SceneMesh.assemble(meshes, 0.1, np.array([[0.3, 0.5, 0.5]]))
+    container = exhaust(bake(scene, BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0}))).objects["room"]
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    light, found = indirect(container, tracer, lamp((0.75, 0.35, 0.25)))
+    assert found.outside == ("lamp",) and not light.any()
+    assert not DirectLight(tracer, container).of([lamp((0.75, 0.35, 0.25))]).any()
+    light, found = indirect(container, tracer, lamp((0.6, 0.35, 0.25)))
+    assert found.outside == () and np.isfinite(light).all() and light.mean() > 0.1
+
+
+def test_regions_that_coincide_count_once():
+    region = box_matrix((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))
+    settings = BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0, "cloud_lights": 27})
+    one, two = (exhaust(bake(room(), settings, regions=np.array([region] * count))) for count in (1, 2))
+    assert one.report["local"]["lights"] == two.report["local"]["lights"] == 27
+    assert np.array_equal(one.objects["room"].cloud.dense, two.objects["room"].cloud.dense)
+
+
+def test_the_light_of_a_lamp_hardly_changes_whatever_merges():
+    """Weights of eq. 9 that are zero or huge: nothing merges, or all do, and what a lamp gives stays sound."""
+    means = []
+    scene = room()
+    tracer = Tracer(scene.points, scene.triangles, 1)
+    for merging in ({"merge_response": 0.0}, {"merge_distance": 1e6}, {"merge_response": 1e6},
+                    {"merge_distance": 1e6, "merge_response": 1e6}):
+        settings = BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0, "cloud_lights": 27, **merging})
+        container = exhaust(bake(scene, settings)).objects["room"]
+        light, found = indirect(container, tracer, lamp((0.4, 0.55, 0.5)))
+        assert np.isfinite(light).all() and found.outside == ()
+        means.append(float(light.mean()))
+    assert max(means) < 1.1 * min(means), means
+
+
 def test_a_job_resumes_and_its_result_is_the_same(tmp_path):
     settings = BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0, "cloud_lights": 27})
     regions = np.array([box_matrix((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))])
