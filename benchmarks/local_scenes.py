@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 WHITE, RED, GREEN, BLUE = (0.75, 0.75, 0.75), (0.63, 0.065, 0.05), (0.14, 0.45, 0.09), (0.1, 0.15, 0.6)
 
+# Roughness of the bunny: the paper's Phong exponent n = 12 as GGX, alpha^2 = 2 / (n + 2), alpha = roughness^2.
+GLOSS = (2.0 / 14.0) ** 0.25
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -194,7 +197,7 @@ def glossy_bunny() -> tuple[bpy.types.Object, NDArray[np.float64]]:
         material.use_nodes = True
     shader = material.node_tree.nodes["Principled BSDF"]
     shader.inputs["Base Color"].default_value = (0.8, 0.8, 0.8, 1.0)
-    shader.inputs["Metallic"].default_value, shader.inputs["Roughness"].default_value = 1.0, 0.5
+    shader.inputs["Metallic"].default_value, shader.inputs["Roughness"].default_value = 1.0, GLOSS
     bunny.data.materials.clear()
     bunny.data.materials.append(material)
     return bunny, np.array([[-1, -1, 0], [1, 1, 2]], float)
