@@ -2,8 +2,8 @@
 """Local light clouds in the scenes of Kristensen et al. 2005, beside their Table 1 and against Cycles. Needs the bpy
 wheel.
 
-    python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze,dense] [--positions 20] [--samples 64] [--docs]
-                                      [--set NAME=VALUE ...]
+    python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze,dense,densest] [--positions 20]
+                                      [--samples 64] [--docs] [--set NAME=VALUE ...]
 
 A lamp moves to held-back random places, half a spacing of the cloud or more from surfaces; indirect light there is
 compared with Cycles' own vertex bake of indirect light (of the glossy bunny: what it sends of it to a camera), as a
@@ -12,7 +12,7 @@ seeds; the mean of (ours - a)(ours - b) is the squared error without Cycles' own
 (of one bake). Columns: `solver`, our solution at the very place (rays of the operator); `cloud`, what interpolation and
 merging add to it; `compression`; `all` of it; `open`, of places a spacing from surfaces and half of one within the
 cloud's box. `move ms`: weights and constants of the clusters; `frame ms`: with direct light and every vertex on the
-processor, one thread, nothing drawn. `dense`: the Cornell box under more lights, merging less.
+processor, one thread, nothing drawn. `dense`, `densest`: the Cornell box under more lights, merging less.
 """
 
 from __future__ import annotations
@@ -64,7 +64,10 @@ SETTINGS = {"cornell": {"cloud_lights": "216", "zone_receivers": "400"},
             "hole": {"cloud_lights": "250", "zone_receivers": "400"},
             "bunny": {"cloud_lights": "125", "zone_receivers": "1200", "glossy_rows": "16"},
             "maze": {"cloud_lights": "1024", "zone_receivers": "2000", "clusters": "192"},
-            "dense": {"cloud_lights": "512", "zone_receivers": "400", "merge_response": "0.02"}}
+            "dense": {"cloud_lights": "512", "zone_receivers": "400", "merge_response": "0.02"},
+            "densest": {"cloud_lights": "2048", "zone_receivers": "400", "merge_response": "0.01", "vectors": "16"}}
+# Spacing by which places are chosen where it is not the cloud's: the Cornell box under more lights keeps its places.
+PLACES = {"dense": 1.0 / 3.0, "densest": 1.0 / 3.0}
 ALL_SCENES = {"lighting": "local", "cloud_emission": "1", "clusters": "64", "vectors": "12", "encoder": "adaptive",
               "gather_directions": "2048", "error_receivers": "0"}
 # Indirect light that a camera sees.
@@ -216,13 +219,13 @@ def milliseconds(kept: Kept, lamp: LampLight, places: NDArray[np.float64]) -> li
 def run(name: str, arguments: argparse.Namespace) -> list:
     """One scene's line of the table."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    thing, box = local_scenes.SCENES["cornell" if name == "dense" else name]()
+    thing, box = local_scenes.SCENES["cornell" if name in PLACES else name]()
     use_cycles(arguments.samples)
     bpy.context.scene.render.threads = 2
     overrides = ALL_SCENES | SETTINGS[name] | dict(s.split("=", 1) for s in arguments.set)
     kept = baked(thing, box, make_settings(arguments.preset, overrides))
     lamp = LampLight(kept.baked.cloud, kept.solver.tracer)
-    spacing = kept.report["local"]["spacing"]
+    spacing = PLACES.get(name, kept.report["local"]["spacing"])
     places = held_back(kept.solver.tracer, box, arguments.positions, arguments.clearance * spacing)
     views, passes, chosen = None, {"INDIRECT"}, kept.visible
     if kept.baked.functions:
@@ -268,7 +271,7 @@ HEADER = ["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", default="cornell,hole,bunny,maze,dense")
+    parser.add_argument("--scenes", default="cornell,hole,bunny,maze,dense,densest")
     parser.add_argument("--positions", type=int, default=20)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--clearance", type=float, default=0.5,
