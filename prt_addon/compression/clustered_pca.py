@@ -76,8 +76,8 @@ class Work:
         return update(self.frame.coordinates[:, :width], state, self.monitor.workers) + float(self.frame.tail[width])
 
     def sweep(self, state: Subspaces, error: float, survey: bool = False) -> tuple[Sweep, float]:
-        """One classification among neighbours (survey: the worst points among all) and one update, on as many values as the error asks
-        for."""
+        """One classification among neighbours (survey: of the worst points among all) and one update, on as many values
+        as the error asks for."""
         width = state.means.shape[1]
         data, before = self.frame.coordinates[:, :width], state.labels
         sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers,

@@ -5,10 +5,10 @@ From one sweep to the next a point moves to a subspace that passes near its own 
 be exact, as only the state that they lead to counts; `reclassify` is.
 
 Points go where the squared error falls most after the subspaces have followed them, not where it is least as they are
-(Hartigan's rule; Telgarsky & Vattani 2010, "Hartigan's Method: k-means Clustering without Voronoi"). With 200 points to a
-cluster of 8 vectors a subspace bends towards each of its points by a few percent, and a point stays for that alone. A
+(Hartigan's rule; Telgarsky & Vattani 2010, "Hartigan's Method: k-means Clustering without Voronoi"). With 200 points to
+a cluster of 8 vectors a subspace bends towards each of its points by a few percent, and a point stays for that alone. A
 point at squared distance d^2 of another subspace adds d^2 / (1 + l) there and takes d^2 / (1 - l) away from its own, l
-its leverage (see `leverages`). Measured (24 x 25 values, 8 vectors): 6 % less squared error on the horse, 3 % on the
+its leverage (see `_Rule`). Measured (24 x 25 values, 8 vectors): 6 % less squared error on the horse, 3 % on the
 Buddha. Whatever the nearest subspace would gain, this gains too, so exact sweeps afterwards undo nothing.
 """
 
@@ -106,11 +106,26 @@ class _Found(NamedTuple):
         return Sweep(changed, self.runner_up, np.bincount(self.labels, self.rise, len(state.means)), unseen)
 
 
-def leverages(state: Subspaces) -> tuple[Single, Single]:
-    """(q, K) and (K,) float32, from which a point's leverage in each subspace is sum_i first_ik w_i^2 + second_k, w_i
-    its weights there: how far the best subspace follows a point, to first order (Jolliffe, Principal Component Analysis
-    (2002), 10.2). First: 1 / (D_i^2 - UNUSED D_(q+1)^2); second: 1 / number of points, for the mean.
+class _Rule(NamedTuple):
+    """What decides between K subspaces beside squared distances.
+
+    scales (q, K), shares (K,): a point's leverage in a subspace is sum_i scales_ik w_i^2 + shares_k, w_i its weights
+    there: how far the best subspace follows a point, to first order (Jolliffe, Principal Component Analysis (2002),
+    10.2). scales: 1 / (D_i^2 - UNUSED D_(q+1)^2); shares: 1 / number of points, for the mean. prices (K,): what the
+    weights cost that a point needs there, see `Subspaces.price`.
     """
+
+    scales: Single
+    shares: Single
+    prices: Single
+
+    def of(self, clusters: NDArray[np.intp]) -> _Rule:
+        """For some of them."""
+        return _Rule(self.scales[:, clusters], self.shares[clusters], self.prices[clusters])
+
+
+def _rule(state: Subspaces) -> _Rule:
+    """See `_Rule`."""
     most = int(state.vectors.max(initial=0))
     spread = state.spread[:, :most]
     used = (np.arange(most) < state.vectors[:, None]) & (spread > 0.0)
@@ -119,8 +134,8 @@ def leverages(state: Subspaces) -> tuple[Single, Single]:
     # Whatever the order of the eigenvalues, which a power step may leave a little wrong: half is left at least.
     differences = np.maximum(spread - UNUSED * unused, 0.5 * spread)
     scales = np.divide(1.0, differences, out=np.zeros_like(spread), where=used)
-    return (np.ascontiguousarray(scales.T, np.float32),
-            (1.0 / np.maximum(state.counts, 1)).astype(np.float32))
+    return _Rule(np.ascontiguousarray(scales.T, np.float32), (1.0 / np.maximum(state.counts, 1)).astype(np.float32),
+                 (state.price * state.vectors).astype(np.float32))
 
 
 def reclassify_near(data: Single, state: Subspaces, lists: NDArray[np.intp], workers: Workers = SERIAL,
@@ -150,13 +165,13 @@ def reclassify_near(data: Single, state: Subspaces, lists: NDArray[np.intp], wor
 def _classify_groups(data: Single, state: Subspaces, lists: NDArray[np.intp], members: list[NDArray[np.intp]],
                      found: _Found, workers: Workers) -> None:
     """Clusters in groups. members: the points of each cluster."""
-    rows, leverage = state.vector_major(), leverages(state)
+    rows, rule = state.vector_major(), _rule(state)
 
     def classify(groups: list[NDArray[np.intp]]) -> None:
         for group in groups:
             points = np.concatenate([members[cluster] for cluster in group])
             tried = np.unique(lists[group])
-            planes = _Planes.of(state.means[tried], rows[:, tried], leverage[0][:, tried], leverage[1][tried])
+            planes = _Planes.of(state.means[tried], rows[:, tried], rule.of(tried))
             for start in range(0, len(points), ROWS):
                 part = points[start:start + ROWS]
                 own = np.searchsorted(tried, state.labels[part])
@@ -171,7 +186,7 @@ def _classify_alone(data: Single, state: Subspaces, lists: NDArray[np.intp], mem
                     found: _Found, workers: Workers) -> None:
     """One cluster after the other. Not in threads: their many small products would pass Python's lock back and forth,
     which costs more than it gains."""
-    rows, (scales, shares) = state.vector_major(), leverages(state)
+    rows, rule = state.vector_major(), _rule(state)
     columns = np.arange(int(state.counts.max()))
     for first in range(0, len(lists), BLOCK):
         planes, offsets, lengths = _planes(state.means, rows, lists[first:first + BLOCK], first)
@@ -182,7 +197,7 @@ def _classify_alone(data: Single, state: Subspaces, lists: NDArray[np.intp], mem
             workers.tick()
             near = lists[cluster]
             squared = _added(data[points] - state.means[cluster], planes[index], offsets[index], lengths[index],
-                             scales[:, near], shares[near])
+                             rule.of(near))
             least, here = squared.argmin(axis=0), columns[:len(points)]
             found.labels[points] = found.runner_up[points] = near[least]
             found.squared[points] = squared[least, here]
@@ -205,9 +220,9 @@ def _planes(means: Single, rows: Single, lists: NDArray[np.intp], first: int) ->
     return planes.reshape(block, -1, means.shape[1]), offsets.reshape(block, -1, 1), row_squares(shift)[:, :, None]
 
 
-def _added(centred: Single, planes: Single, offsets: Single, lengths: Single, scales: Single, shares: Single) -> Single:
+def _added(centred: Single, planes: Single, offsets: Single, lengths: Single, rule: _Rule) -> Single:
     """The squared error (J, m) that points centred (m, d) add to subspaces that `_planes` prepared, of which the first
-    is their own. scales (q, J), shares (J,): of `leverages`."""
+    is their own, and the price of their weights there."""
     near = len(lengths)
     products = multiply(planes, centred.T)
     squared = products[len(offsets):] * np.float32(-2)
@@ -220,14 +235,15 @@ def _added(centred: Single, planes: Single, offsets: Single, lengths: Single, sc
     inside *= inside
     inside = inside.reshape(-1, near, len(centred))
     squared -= np.add.reduce(inside, axis=0)
-    inside *= scales[:, :, None]
+    inside *= rule.scales[:, :, None]
     leverage = np.add.reduce(inside, axis=0)
-    leverage += shares[:, None]
+    leverage += rule.shares[:, None]
     np.minimum(leverage, MOST_LEVERAGE, out=leverage)
     np.negative(leverage[0], out=leverage[0])
     leverage += 1
     np.maximum(squared, 0, out=squared)  # below zero is rounding
     squared /= leverage
+    squared += rule.prices[:, None]
     return squared
 
 
@@ -255,8 +271,7 @@ def _classify_by_all(data: Single, state: Subspaces, points: NDArray[np.intp], f
                      workers: Workers) -> None:
     """Try these points with all subspaces that have any. follow: count how these would follow the points."""
     filled = np.flatnonzero(state.counts).astype(np.int32)
-    scales, shares = leverages(state)
-    planes = _Planes.of(state.means[filled], state.vector_major()[:, filled], scales[:, filled], shares[filled])
+    planes = _Planes.of(state.means[filled], state.vector_major()[:, filled], _rule(state).of(filled))
 
     def classify(start: int) -> None:
         part = points[start:start + ROWS]
@@ -283,16 +298,15 @@ class _Planes(NamedTuple):
 
     Differences are taken from the means' centre (d,), so that rounding stays small against the clusters' own size. The
     products with the centre come out of the same product as those with the points, from a last value that is 1.
-    planes: (q + 1, J, d + 1); scales (q, J), shares (J,): of `leverages`.
+    planes: (q + 1, J, d + 1).
     """
 
     centre: Single
     planes: Single
-    scales: Single
-    shares: Single
+    rule: _Rule
 
     @staticmethod
-    def of(means: Single, rows: Single, scales: Single, shares: Single) -> _Planes:
+    def of(means: Single, rows: Single, rule: _Rule) -> _Planes:
         """means (J, d), vectors rows (q, J, d)."""
         most, count, values = rows.shape
         centre = means.mean(axis=0)
@@ -301,7 +315,7 @@ class _Planes(NamedTuple):
         planes[:most, :, :values], planes[most, :, :values] = rows, shift
         planes[:most, :, values] = -(rows * shift).sum(axis=-1)
         planes[most, :, values] = row_squares(shift) * np.float32(-0.5)
-        return _Planes(centre, planes, scales, shares)
+        return _Planes(centre, planes, rule)
 
     def two_best(self, points: Single, own: NDArray[np.intp] | None,
                  ) -> tuple[NDArray[np.intp], NDArray[np.intp], Single, Single]:
@@ -324,14 +338,16 @@ class _Planes(NamedTuple):
 
     def _follow(self, squared: Single, inside: Single, own: NDArray[np.intp]) -> None:
         """From squared distances to what a point adds, in place; inside: (q, J, m) squared weights, lost."""
-        inside *= self.scales[:, :, None]
+        inside *= self.rule.scales[:, :, None]
         leverage = np.add.reduce(inside, axis=0)
-        leverage += self.shares[:, None]
+        leverage += self.rule.shares[:, None]
+        np.minimum(leverage, MOST_LEVERAGE, out=leverage)
         here = np.arange(len(own))
-        leverage[own, here] = -np.minimum(leverage[own, here], MOST_LEVERAGE)
+        leverage[own, here] *= -1
         leverage += 1
         np.maximum(squared, 0, out=squared)  # below zero is rounding
         squared /= leverage
+        squared += self.rule.prices[:, None]
 
 
 def _two_least(squared: Single) -> tuple[NDArray[np.intp], NDArray[np.intp], Single, Single]:
