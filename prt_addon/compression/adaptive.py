@@ -15,7 +15,7 @@ from .subspaces import SPARE, Subspaces
 # Rounds of redistributing vectors and reclassifying, at most, and of signals whose sweeps on all values would cost most
 # of the time; the relative decrease of the squared error, in tolerances, below which a round was in vain, and after how
 # many of those in a row it ends; which look at all subspaces.
-ROUNDS, WIDE_ROUNDS, PATIENCE, MOST_IN_VAIN, SURVEY_EVERY = 12, 18, 0.05, 2, 6
+ROUNDS, WIDE_ROUNDS, PATIENCE, MOST_IN_VAIN, SURVEY_EVERY = 12, 16, 0.05, 2, 6
 # Updates after vectors are added, so that power steps find the spectra that decide about them.
 SPECTRUM_STEPS = 2
 

@@ -50,7 +50,7 @@ WORTH_THE_FIRST, WORTH_ANOTHER = 0.003, 0.005
 SURVEYED = 0.6
 # Of wide signals: sweeps for each number of vectors but the last LAST, and for those, where they help most; after how
 # many the first and the next ones look at all subspaces; LBG iterations before all.
-FIRST_SWEEPS, LAST_SWEEPS, LAST, SURVEY, SURVEY_EVERY, LBG_ITERATIONS = 3, 4, 2, 1, 3, 6
+FIRST_SWEEPS, LAST_SWEEPS, LAST, SURVEY, SURVEY_EVERY, LBG_ITERATIONS = 3, 10, 1, 1, 3, 6
 
 
 @dataclass
