@@ -1,0 +1,367 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The steps of an artist who moves lamps after a bake: run by run.py, one step per timer call (driving.py).
+
+What the viewport shows is compared with the core's own relighting on the CPU, vertex by vertex: the screenshot's pixel
+at each vertex that the camera sees, against its radiance through sRGB.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+sys.path.insert(0, str(Path(__file__).parent))  # Blender runs this file by its path
+
+from driving import (
+    DRAWN,
+    MODULE,
+    SCENE,
+    Step,
+    area,
+    baked_names,
+    carrier,
+    children,
+    override,
+    region,
+    session,
+    shoot,
+    start,
+    until,
+    wait_for_bake,
+)
+
+OBJECTS = {"Floor", "Ceiling", "Back", "Left", "Right", "Box"}
+WALLS = ("Floor", "Back", "Left", "Right")
+# The job of the cancel tests: long enough in the lamps' stage to be met there.
+LONG = "cloud_lights=1200, merge_response=0, gather_directions=512, error_receivers=0"
+LAMPS_STAGE = "Local lights"
+# Levels of 255 that a pixel may differ from the oracle in the mean, and all but a hundredth of the pixels: the vertex
+# lies up to half a pixel beside it.
+MEAN_LEVELS, MOST_LEVELS = 1.0, 6.0
+
+
+def core(name: str) -> object:
+    """A module of the installed extension."""
+    return import_module(f"{MODULE}.{name}")
+
+
+def lamp(name: str = "Lamp") -> bpy.types.Object:
+    return bpy.data.objects[name]
+
+
+def oracle() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By name: positions (p, 3) and radiance (p, 3) towards the normal under the scene's light, from the CPU alone."""
+    stored, scene_light = core("prt_addon.blender.stored"), core("prt_addon.relighting.scene_light")
+    relit, lamps_of = core("prt_addon.relighting.exit_radiance"), core("operators.scene_lamps").SceneLamps()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    baked = {o.name: stored.read_baked(o) for o in stored.baked_objects(bpy.context.scene)}
+    lamps, result = lamps_of.step(baked, depsgraph, []), {}
+    order = max(b.lighting_basis.order for b in baked.values())
+    distant = core("prt_addon.blender.lights").light_coefficients(bpy.context.scene, depsgraph, order).coefficients \
+        if order else None
+    for name, transfer in baked.items():
+        light = scene_light.joined_light(transfer.lighting_basis, distant, lamps_of.cloud_light(transfer))
+        direct = lamps_of.direct(name, transfer, lamps)
+        result[name] = transfer.positions, relit.view_radiance(transfer, light, transfer.normals, direct)
+    return result
+
+
+def srgb(radiance: np.ndarray) -> np.ndarray:
+    """Levels 0..255 of linear values."""
+    clipped = np.clip(radiance, 0.0, 1.0)
+    return 255.0 * np.where(clipped < 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1.0 / 2.4) - 0.055)
+
+
+def seen(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which positions (p, 3) the camera sees inside the walls' edges, and their pixels (n, 2) as row and column."""
+    box, matrix = region(), np.array(area().spaces.active.region_3d.perspective_matrix)
+    clip = np.c_[positions, np.ones(len(positions))] @ matrix.T
+    place = 0.5 * clip[:, :2] / clip[:, 3:] + 0.5
+    column, row = box.x + place[:, 0] * box.width, 999 - (box.y + place[:, 1] * box.height)
+    inner = (np.abs(positions - (0.0, 0.0, 1.0)) < 0.9).sum(axis=1) >= 2
+    eye, depsgraph = bpy.context.scene.camera.location, bpy.context.evaluated_depsgraph_get()
+    for index in np.flatnonzero(inner):
+        ray = Vector(positions[index]) - eye
+        hit, where, *_ = bpy.context.scene.ray_cast(depsgraph, eye, ray)
+        inner[index] = hit and (where - Vector(positions[index])).length < 0.01
+    inner &= (column > box.x + 60) & (column < box.x + box.width - 330) & (row > 130) & (row < 985 - box.y)
+    return inner, np.stack([row, column], axis=1)[inner].astype(int)
+
+
+def differences(picture: np.ndarray, names: tuple[str, ...] = WALLS) -> np.ndarray:
+    """Levels (n, 3) by which a screenshot is brighter than the oracle at the vertices of these objects."""
+    found = []
+    for name, (positions, radiance) in oracle().items():
+        if name in names:
+            inner, pixel = seen(positions)
+            found.append(picture[pixel[:, 0], pixel[:, 1]].astype(float) - srgb(radiance[inner]))
+    return np.concatenate(found)
+
+
+def check_picture(name: str) -> np.ndarray:
+    """A screenshot NAME.png that shows what the oracle says."""
+    picture = shoot(name)
+    off = differences(picture)
+    spread = np.sort(np.abs(off).max(axis=1))
+    print(f"{name}: {len(off)} vertices, mean {off.mean():+.2f}, {np.abs(off).mean():.2f} levels, "
+          f"99 % below {spread[int(0.99 * len(spread))]:.1f}", flush=True)
+    assert len(off) > 300, f"{name}: only {len(off)} vertices in sight"
+    assert np.abs(off).mean() < MEAN_LEVELS, f"{name}: {np.abs(off).mean():.2f} levels off"
+    assert spread[int(0.99 * len(spread))] < MOST_LEVELS, f"{name}: {spread[-10:]} levels off"
+    return picture
+
+
+def colour_at(picture: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
+    """Mean colour (3,) of the 9 x 9 pixels around a point of the world."""
+    box, matrix = region(), np.array(area().spaces.active.region_3d.perspective_matrix)
+    clip = matrix @ (*place, 1.0)
+    column = int(box.x + (0.5 * clip[0] / clip[3] + 0.5) * box.width)
+    row = int(999 - (box.y + (0.5 * clip[1] / clip[3] + 0.5) * box.height))
+    return picture[row - 4:row + 5, column - 4:column + 5].reshape(-1, 3).astype(float).mean(axis=0)
+
+
+def invoke(overrides: str = "") -> None:
+    with override():
+        assert bpy.ops.prt.bake("INVOKE_DEFAULT", overrides=overrides) == {"RUNNING_MODAL"}, session().message
+
+
+def jobs() -> list[Path]:
+    folder = core("operators.bake_session").jobs_folder()
+    return sorted(folder.glob("bake-*")) if folder.is_dir() else []
+
+
+def left_over() -> list[str]:
+    """What an unfinished bake may not leave behind: half-written files, responses."""
+    return [str(path) for job in jobs() for path in (*job.glob(".*.part"), *job.glob("responses-*"))]
+
+
+def open_room() -> Step:
+    """The panel shows the settings of local lights."""
+    with override():
+        bpy.ops.wm.open_mainfile(filepath=str(SCENE), load_ui=False)
+    yield 1.0
+    space, settings = area().spaces.active, bpy.context.scene.prt
+    space.show_region_ui, space.show_region_toolbar, space.shading.type = True, False, "MATERIAL"
+    space.overlay.show_overlays, space.show_gizmo = False, False
+    space.region_3d.view_perspective = "CAMERA"
+    settings.preset, settings.lighting = "draft", "local"
+    yield 1.5
+    region("UI").active_panel_category = "PRT"
+    yield 1.5
+    with override():
+        assert bpy.ops.prt.analyze() == {"FINISHED"}
+    yield 1.0
+    shoot("l01_analysis")
+
+
+def bake_lamps() -> Step:
+    """A bake for lamps runs beside Blender and tells of its light cloud."""
+    invoke("merge_response=0.02")
+    stages = set()
+    while session().running and not (LAMPS_STAGE in stages and session().stage != LAMPS_STAGE):
+        if session().stage == LAMPS_STAGE and LAMPS_STAGE not in stages:
+            shoot("l02_baking")
+        stages.add(session().stage)
+        yield 0.02
+    yield from wait_for_bake()
+    assert not session().failed, session().message
+    assert LAMPS_STAGE in stages, stages
+    yield from until(lambda: baked_names() == OBJECTS, f"the panel lists {baked_names()}")
+    assert not children() and not jobs()
+    yield DRAWN
+    shoot("l03_baked")
+
+
+def undo_and_redo() -> Step:
+    """One undo takes the bake away, redo brings it back, cloud and kernels too."""
+    with override():
+        bpy.ops.ed.undo()
+    yield from until(lambda: carrier("Floor") is None and not baked_names(), "undo leaves the bake")
+    with override():
+        bpy.ops.ed.redo()
+    yield from until(lambda: carrier("Floor") and baked_names() == OBJECTS, "redo does not bring the bake back")
+    assert {"prt_cloud", "prt_bases"} <= set(carrier("Floor").keys())
+
+
+def preview() -> Step:
+    """The viewport shows what the CPU says, in both shadings that a lamp is dragged in."""
+    with override():
+        assert bpy.ops.prt.toggle_preview() == {"FINISHED"}
+    for shading in ("SOLID", "MATERIAL"):
+        area().spaces.active.shading.type = shading
+        yield 2.0 * DRAWN
+        check_picture(f"l04_{shading.lower()}")
+    assert not session().preview_message, session().preview_message
+
+
+def drag() -> Step:
+    """A lamp dragged in small moves: the picture follows meanwhile, and settles on what the CPU says."""
+    first = shoot("l05_before_drag")
+    begin, end, moves = Vector(lamp().location), Vector((-0.6, 0.2, 0.9)), 12
+    left, right = (-0.98, 0.2, 0.9), (0.98, -0.1, 1.3)
+    levels = [(colour_at(first, left)[0], colour_at(first, right).mean())]
+    for move in range(1, moves + 1):
+        lamp().location = begin.lerp(end, move / moves)
+        yield 0.15
+        if move % 4 == 0:
+            picture = shoot(f"l05_drag_{move}")
+            levels.append((colour_at(picture, left)[0], colour_at(picture, right).mean()))
+    yield DRAWN
+    last = check_picture("l06_after_drag")
+    lefts, rights = zip(*levels, strict=True)
+    assert all(np.diff(lefts) > 0), f"the red wall does not brighten as the lamp comes near: {lefts}"
+    assert all(np.diff(rights) < 0), f"the right wall does not darken as the lamp goes: {rights}"
+    floor = (-0.75, 0.6, 0.0)
+    redness = [colour_at(p, floor)[0] / colour_at(p, floor)[2] for p in (first, last)]
+    assert redness[1] > 1.05 * redness[0], f"the floor beside the red wall does not redden: {redness}"
+
+
+def follow_lamp() -> Step:
+    """Power, colour and hiding are followed, each to what the CPU says."""
+    energy = lamp().data.energy
+    lamp().data.energy = 0.3 * energy
+    yield DRAWN
+    dim = check_picture("l07_dim")
+    lamp().data.energy, lamp().data.color = energy, (0.2, 0.4, 1.0)
+    yield DRAWN
+    blue = check_picture("l08_blue")
+    assert colour_at(blue, (0.0, 0.98, 1.6))[2] > 1.5 * colour_at(blue, (0.0, 0.98, 1.6))[0]
+    lamp().data.color = (1.0, 1.0, 1.0)
+    lamp().hide_render = lamp().hide_viewport = True
+    yield DRAWN
+    hidden = check_picture("l09_hidden")
+    assert colour_at(hidden, (-0.98, 0.2, 0.9))[0] < colour_at(dim, (-0.98, 0.2, 0.9))[0]
+    lamp().hide_render = lamp().hide_viewport = False
+    yield DRAWN
+    check_picture("l10_shown_again")
+
+
+def play() -> Step:
+    """A keyframed lamp plays back, and frame 1 gives the first picture again."""
+    scene = bpy.context.scene
+    lamp().keyframe_insert("location", frame=1)
+    lamp().location = (0.5, -0.3, 1.5)
+    lamp().keyframe_insert("location", frame=24)
+    scene.frame_start, scene.frame_end = 1, 24
+    scene.frame_set(1)
+    yield DRAWN
+    first = check_picture("l11_frame_1")
+    scene.frame_set(24)
+    yield DRAWN
+    assert np.abs(check_picture("l12_frame_24") - first.astype(float)).mean() > 1.0
+    scene.frame_set(1)
+    yield DRAWN
+    box = slice(130, 700), slice(300, 900)
+    again = np.abs(shoot("l13_frame_1_again")[box].astype(float) - first[box])
+    assert again.max() <= 1.0, f"frame 1 differs from itself by {again.max()} levels"
+    with override():
+        bpy.ops.screen.animation_play()
+    frames, pictures = set(), []
+    for shot in range(3):
+        yield 1.1
+        frames.add(scene.frame_current)
+        pictures.append(shoot(f"l14_playing_{shot}")[box].astype(float))
+    with override():
+        bpy.ops.screen.animation_cancel(restore_frame=False)
+    assert len(frames) > 1, "the animation does not play"
+    assert max(np.abs(p - pictures[0]).mean() for p in pictures) > 1.0, "the picture stands while the lamp moves"
+    scene.frame_set(1)
+    yield DRAWN
+    again = np.abs(shoot("l15_after_play")[box].astype(float) - first[box])
+    assert again.max() <= 1.0, f"frame 1 after playing differs by {again.max()} levels"
+    lamp().animation_data_clear()
+
+
+def lamp_outside() -> Step:
+    """A lamp outside of the cloud is named, in the panel and beside itself."""
+    place = Vector(lamp().location)
+    lamp().location = (1.6, 0.0, 1.4)
+    area().spaces.active.overlay.show_overlays = True
+    yield DRAWN
+    assert "Lamp" in session().preview_message and "outside" in session().preview_message, session().preview_message
+    shoot("l16_outside")
+    area().spaces.active.overlay.show_overlays = False
+    lamp().location = place
+    yield DRAWN
+    assert not session().preview_message, session().preview_message
+    check_picture("l17_inside_again")
+
+
+def cancel_in_lamps_stage() -> Step:
+    """Cancel answers within a second, leaves nothing half-written, and the next bake goes on from there."""
+    before = carrier("Floor")["prt_header"]
+    invoke(LONG)
+    yield from until(lambda: session().stage == LAMPS_STAGE or not session().running, "no lamps' stage", 120.0)
+    yield 1.0
+    assert session().running and session().stage == LAMPS_STAGE, (session().stage, session().message)
+    shoot("l18_lamps_stage")
+    started = time.monotonic()
+    assert bpy.ops.prt.cancel() == {"FINISHED"}
+    while session().running:
+        assert time.monotonic() - started < 1.0, "cancel does not answer"
+        yield 0.02
+    assert not children() and not session().failed and "cancel" in session().message.lower()
+    assert carrier("Floor")["prt_header"] == before
+    assert len(jobs()) == 1 and not left_over(), left_over()
+    finished = {p.name: p.stat().st_mtime_ns for p in jobs()[0].glob("*.npz")}
+    assert {"gather.npz", "direct.npz", "interreflection.npz"} <= set(finished), finished
+    yield 0.5
+    check_picture("l19_cancelled")
+
+
+def resume_after_kill() -> Step:
+    """The process dies in the lamps' stage: nothing is left over, and the bake resumes after its finished stages."""
+    finished = {p.name: p.stat().st_mtime_ns for p in jobs()[0].glob("*.npz")}
+    invoke(LONG)
+    yield from until(lambda: session().stage == LAMPS_STAGE or not session().running, "no lamps' stage", 60.0)
+    yield 1.0
+    assert session().running, session().message
+    os.kill(children()[0], signal.SIGKILL)
+    yield from until(lambda: not session().running, "the bake still runs without its process")
+    assert session().failed and "SIGKILL" in session().message, session().message
+    assert len(jobs()) == 1 and not left_over(), left_over()
+    assert {p.name: p.stat().st_mtime_ns for p in jobs()[0].glob("*.npz")} == finished, "stages were baked again"
+    invoke(LONG)
+    yield from until(lambda: session().stage == LAMPS_STAGE or not session().running, "no lamps' stage", 60.0)
+    while session().running and session().stage == LAMPS_STAGE:
+        yield 0.05
+    assert {name: stamp for name, stamp in {p.name: p.stat().st_mtime_ns for p in jobs()[0].glob("*.npz")}.items()
+            if name in finished} == finished, "stages were baked again"
+    yield from wait_for_bake()
+    assert not session().failed, session().message
+    assert not jobs() and not children()
+    yield 2.0 * DRAWN
+    check_picture("l20_resumed")
+
+
+def both_kinds() -> Step:
+    """Sky and lamps in one bake: each is followed."""
+    bpy.context.scene.prt.lighting = "both"
+    background = bpy.context.scene.world.node_tree.nodes["Background"].inputs
+    background["Color"].default_value, background["Strength"].default_value = (0.3, 0.5, 1.0, 1.0), 0.6
+    invoke("merge_response=0.02")
+    yield from wait_for_bake()
+    assert not session().failed, session().message
+    yield 2.0 * DRAWN
+    with_sky = check_picture("l21_both")
+    background["Strength"].default_value = 0.05
+    yield DRAWN
+    dark_sky = check_picture("l22_both_dark_sky")
+    assert dark_sky.mean() < with_sky.mean()
+    lamp().location = (0.6, 0.1, 0.7)
+    yield DRAWN
+    check_picture("l23_both_lamp_moved")
+
+
+STEPS = (open_room, bake_lamps, undo_and_redo, preview, drag, follow_lamp, play, lamp_outside, cancel_in_lamps_stage,
+         resume_after_kill, both_kinds)
+
+start(STEPS, "lamps")
