@@ -23,13 +23,15 @@ from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
+from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
-from .scene_lamps import SceneLamps, lamps_signature
+from .scene_lamps import SceneLamps, lamps_signature, moved_lamps
 
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
+STILL_SECONDS = 0.25  # after its last move a lamp counts as let go, and its soft shadows are refined
 NOTE_WAIT = 1.0  # after a redraw was asked for, its outcome is known
 SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
@@ -53,8 +55,11 @@ class Live:
     shown: dict[str, Shown] = field(default_factory=dict)
     light: NDArray[np.float64] | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
+    lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
     lamps_time: float = 0.0
+    moving: set[str] = field(default_factory=set)
+    moved_time: float = 0.0
     signature: Hashable = None
     rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
     light_seconds: float = 0.0
@@ -209,16 +214,39 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     now, baked = time.perf_counter(), {name: shown.baked for name, shown in _live.shown.items()}
     lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time)
     _live.lamps_time = now
-    signature = lamps_signature(lamps)
+    _note_moves(lamps, now)
+    signature = lamps_signature(lamps), frozenset(_live.moving)
     if signature != _live.lamps_signature or any(
             shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature = signature
         for name, shown in _live.shown.items():
-            shown.direct = _live.lamps.direct(name, shown.baked, lamps)
+            shown.direct = _live.lamps.direct(name, shown.baked, lamps, _live.moving)
         viewport.redraw()
     if not _live.lamps.settled:
         _live.light_dirty = True
         viewport.redraw()
+
+
+def _note_moves(lamps: list[LocalLight], now: float) -> None:
+    """Find out which lamps are being dragged, and see to it that their soft shadows are refined afterwards."""
+    moved = moved_lamps(lamps, _live.lamps_read)
+    _live.lamps_read = lamps
+    if moved:
+        _live.moving, _live.moved_time = _live.moving | moved, now
+        if not bpy.app.background and not bpy.app.timers.is_registered(_refine):
+            bpy.app.timers.register(_refine, first_interval=STILL_SECONDS, persistent=True)
+    elif now - _live.moved_time >= STILL_SECONDS:
+        _live.moving = set()
+
+
+def _refine() -> float | None:
+    """Once no lamp moves any more, have their light evaluated as if none had; the seconds until it is to ask again."""
+    left = _live.moved_time + STILL_SECONDS - time.perf_counter()
+    if left > 0.0:
+        return left
+    if _live.moving:
+        light_changed()
+    return None
 
 
 def _schedule(wait: float) -> None:
@@ -313,7 +341,7 @@ def unregister() -> None:
     """Leave no handler, timer or GPU object behind."""
     for handlers, handler in HANDLERS:
         handlers.remove(handler)
-    for timer in (_catch_up, _note_viewport):
+    for timer in (_catch_up, _note_viewport, _refine):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     disable()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Container, Hashable, Sequence
 from dataclasses import dataclass, field
 
 import bpy
@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.lighting.local_lights import LocalLight
-from ..prt_addon.relighting.lamp_light import AT_ONCE, CloudLight, DirectLight, LampLight
+from ..prt_addon.relighting.lamp_light import (
+    AT_ONCE,
+    QUICK_SAMPLES,
+    SHADOW_SAMPLES,
+    CloudLight,
+    DirectLight,
+    LampLight,
+    lamp_shape,
+)
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
@@ -75,19 +83,30 @@ class SceneLamps:
         found = self._lit.get(_cloud_key(baked)) if baked.cloud is not None else None
         return None if found is None else found.values
 
-    def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight]) -> NDArray[np.float32] | None:
-        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud."""
+    def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
+               moving: Container[str] = ()) -> NDArray[np.float32] | None:
+        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud.
+
+        moving: keys of lamps that are being dragged, whose soft shadows may be coarse.
+        """
         if baked.cloud is None:
             return None
         if name not in self._direct:
             self._direct[name] = DirectLight(self._tracer, baked)
-        return self._direct[name].of(lamps)
+        samples = [QUICK_SAMPLES if lamp.key in moving else SHADOW_SAMPLES for lamp in lamps]
+        return self._direct[name].of(lamps, samples)
 
 
 def lamps_signature(lamps: Sequence[LocalLight]) -> Hashable:
     """Changes when a lamp does."""
-    return tuple((lamp.key, lamp.kind, lamp.matrix.tobytes(), lamp.power.tobytes(), lamp.radius, lamp.soft_falloff,
-                  lamp.spot_angle, lamp.spot_blend, lamp.shape, lamp.size, lamp.spread, lamp.shadow) for lamp in lamps)
+    return tuple((lamp.key, lamp_shape(lamp), lamp.power.tobytes()) for lamp in lamps)
+
+
+def moved_lamps(lamps: Sequence[LocalLight], before: Sequence[LocalLight]) -> set[str]:
+    """Keys of lamps with soft shadows that are elsewhere, or of another shape, than before. New ones are not."""
+    shapes = {lamp.key: lamp_shape(lamp) for lamp in before}
+    return {lamp.key for lamp in lamps if lamp.extent > 0.0 and shapes.get(lamp.key, lamp_shape(lamp))
+            != lamp_shape(lamp)}
 
 
 def _cloud_key(baked: BakedTransfer) -> str:
