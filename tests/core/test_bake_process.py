@@ -43,7 +43,7 @@ def run_job(folder):
             (folder / "responses-abc" / "zone_0.npy").write_bytes(b"much")
             (folder / ".local.npz.1.part").write_bytes(b"half")
             (folder / "gather.npz").write_bytes(b"whole")
-        yield Progress("tracing", 0.5, 1000, None)
+        yield Progress("encoding", 0.5, 1000, None)
         time.sleep(60)
     elif kind == "chatters":
         for number in range(20000):
