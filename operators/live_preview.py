@@ -27,7 +27,7 @@ from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
-from .scene_lamps import SceneLamps, lamps_signature, moved_lamps
+from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
 
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
@@ -154,18 +154,35 @@ def _read_bakes() -> None:
         if baked is None:
             continue
         line.clusters, line.points = int(baked.bases.shape[0]), len(baked.cluster)
-        own, coherence = baked.header.get("own_errors", {}), baked.header.get("coherence") or {}
-        for name, part, key in (("error", "diffuse", "errors"), ("highlight_error", "highlights", "highlight_errors")):
-            # The object's own error; where it had too few points to measure one, those of the whole bake.
-            whole = -1.0 if own or (part == "highlights" and not baked.functions) else \
-                baked.header.get(key, {}).get("total", -1.0)
-            setattr(line, name, float(own.get(part, whole)))
+        coherence = baked.header.get("coherence") or {}
+        line.error, line.highlight_error, line.lamp_error = _errors_of(baked)
         line.overdraw = float(coherence.get("both", 0.0))
         line.overdraw_before = float(coherence.get("before", 0.0))
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
         line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
         _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)))
+    clouds = {cloud_key(shown.baked): cloud_lines(shown.baked.cloud) for shown in _live.shown.values()
+              if shown.baked.cloud is not None}
+    assign(state, cloud="\n".join(clouds.values()))
     _read_stale()
+
+
+def _errors_of(baked: BakedTransfer) -> tuple[float, float, float]:
+    """Measured errors of diffuse light, highlights and lamps' bounced light; -1 for what was not measured.
+
+    The object's own errors; where it had too few points to measure one, those of the whole bake.
+    """
+    header, own = baked.header, baked.header.get("own_errors", {})
+    only_lamps = header.get("settings", {}).get("lighting") == "local"
+    keys = {"diffuse": None if only_lamps else "errors",
+            "highlights": "highlight_errors" if baked.functions else None,
+            "bounced light of lamps": "errors" if only_lamps else "local_errors"}
+    found = []
+    for part, key in keys.items():
+        mine = own.get("diffuse" if only_lamps and key == "errors" else part) if key else None
+        whole = header.get(key, {}).get("total", -1.0) if key and not own else -1.0
+        found.append(float(whole if mine is None else mine))
+    return tuple(found)
 
 
 def _read_stale() -> None:

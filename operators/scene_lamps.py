@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
+from ..prt_addon.lighting.light_cloud import LightCloud
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.lamp_light import (
     AT_ONCE,
@@ -22,6 +23,7 @@ from ..prt_addon.relighting.lamp_light import (
     LampLight,
     lamp_shape,
 )
+from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
@@ -63,7 +65,7 @@ class SceneLamps:
             self._tracer = Tracer(scene.points, scene.triangles, threads=1)
         self._lit = {}
         for transfer in near.values():
-            key = _cloud_key(transfer)
+            key = cloud_key(transfer)
             if key in self._lit:
                 continue
             if key not in self._clouds:
@@ -80,7 +82,7 @@ class SceneLamps:
 
     def cloud_light(self, baked: BakedTransfer) -> NDArray[np.float32] | None:
         """The lamps' light (zones, columns, 3) in the cloud of a bake; None without a cloud."""
-        found = self._lit.get(_cloud_key(baked)) if baked.cloud is not None else None
+        found = self._lit.get(cloud_key(baked)) if baked.cloud is not None else None
         return None if found is None else found.values
 
     def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
@@ -109,5 +111,17 @@ def moved_lamps(lamps: Sequence[LocalLight], before: Sequence[LocalLight]) -> se
             != lamp_shape(lamp)}
 
 
-def _cloud_key(baked: BakedTransfer) -> str:
+def cloud_key(baked: BakedTransfer) -> str:
+    """The same for bakes with the same light cloud."""
     return digest_arrays(baked.cloud.positions, baked.cloud.zone_starts, baked.cloud.dense)
+
+
+def cloud_lines(cloud: LightCloud) -> str:
+    """What a light cloud is, in short lines for the panel."""
+    kept = np.diff(cloud.zone_starts)
+    merged = f"{kept.min()}" if kept.min() == kept.max() else f"{kept.min()} to {kept.max()}"
+    zones = "1 zone" if len(kept) == 1 else f"{len(kept)} zones"
+    functions = cloud.emission_order ** 2
+    each = "" if functions == 1 else f", {functions} for each light"
+    return (f"{plural(len(cloud.dense), 'light', 'lights')} every {cloud.spacing:.3g} m\n"
+            f"merged to {merged} in {zones}\n{plural(cloud.columns, 'column', 'columns')}{each}")

@@ -633,7 +633,7 @@ class _Bake:
         compressed /= self.local_scale * np.maximum(share, LEAST_DIFFUSE)[:, None, None]
         return (yield from self._follow("errors", local_budget(
             self.tracer, self.scene, self.albedo, keys, self.local.cloud, self.local.zone[keys], self.local.probes,
-            before, compressed, settings.bounces, settings.error_paths, settings.seed)))
+            before, compressed, settings.bounces, settings.error_paths, settings.seed, *self._objects_of(keys))))
 
     def _objects_of(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
         """The number of each receiver's target, and the targets' names."""

@@ -71,6 +71,8 @@ GLOSSARY = (
      "weights for the cluster's vectors, which takes much less memory than storing everything for every point."),
     ("Overdraw", "how often the mesh's triangles would be drawn if each cluster were drawn on its own; 1 is best."),
     ("Supercluster", "several clusters that an old graphics card could hold at once and draw as one."),
+    ("Light cloud", "lights spread evenly over the space where lamps will move; the light that each of them sends"
+     " around by bounces is baked, and a lamp takes its own from those nearest to it."),
     ("Highlight", "the light that a surface reflects like a blurred mirror: it changes with the direction of view."),
 )
 

@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Generator
 from importlib import import_module
 from pathlib import Path
 
@@ -46,7 +47,8 @@ LAMPS_STAGE = "Local lights"
 # Levels of 255 that a pixel may differ from the oracle in the mean, and all but a hundredth of the pixels: the vertex
 # lies up to half a pixel beside it.
 MEAN_LEVELS, MOST_LEVELS = 1.0, 6.0
-CORNER = (-0.8, 0.98, 1.7)  # on the back wall, beside the red one
+PATIENCE = 20.0  # seconds
+CORNERS = ((-0.85, 0.98, 1.7), (0.85, 0.98, 1.7))  # on the back wall, beside the red one and opposite
 
 
 def core(name: str) -> object:
@@ -114,16 +116,24 @@ def differences(picture: np.ndarray, names: tuple[str, ...] = WALLS) -> np.ndarr
     return np.concatenate(found)
 
 
-def check_picture(name: str) -> np.ndarray:
-    """A screenshot NAME.png that shows what the oracle says."""
-    picture = shoot(name)
-    off = differences(picture)
-    spread = np.sort(np.abs(off).max(axis=1))
-    print(f"{name}: {len(off)} vertices, mean {off.mean():+.2f}, {np.abs(off).mean():.2f} levels, "
-          f"99 % below {spread[int(0.99 * len(spread))]:.1f}", flush=True)
+def check_picture(name: str) -> Generator[float, None, np.ndarray]:
+    """A screenshot NAME.png that shows what the oracle says, soon: software drawing on a loaded machine takes its
+    time."""
+    started, before = time.monotonic(), None
+    while True:
+        yield 0.5
+        picture = shoot(name)
+        off = differences(picture)
+        mean, most = float(np.abs(off).mean()), float(np.percentile(np.abs(off).max(axis=1), 99.0))
+        right, seconds = mean < MEAN_LEVELS and most < MOST_LEVELS, time.monotonic() - started
+        right &= before is not None and np.abs(off - before).max() <= 1.0  # it has settled, too
+        before = off
+        if right or seconds > PATIENCE:
+            break
+    print(f"{name}: {len(off)} vertices, mean {off.mean():+.2f}, {mean:.2f} levels, 99 % below {most:.1f}, after "
+          f"{seconds:.1f} s", flush=True)
     assert len(off) > 300, f"{name}: only {len(off)} vertices in sight"
-    assert np.abs(off).mean() < MEAN_LEVELS, f"{name}: {np.abs(off).mean():.2f} levels off"
-    assert spread[int(0.99 * len(spread))] < MOST_LEVELS, f"{name}: {spread[-10:]} levels off"
+    assert right, f"{name}: {mean:.2f} levels off in the mean, a hundredth {most:.1f} or more"
     return picture
 
 
@@ -205,8 +215,7 @@ def preview() -> Step:
         assert bpy.ops.prt.toggle_preview() == {"FINISHED"}
     for shading in ("SOLID", "MATERIAL"):
         area().spaces.active.shading.type = shading
-        yield 2.0 * DRAWN
-        check_picture(f"l04_{shading.lower()}")
+            yield from check_picture(f"l04_{shading.lower()}")
     assert not session().preview_message, session().preview_message
 
 
@@ -222,33 +231,28 @@ def drag() -> Step:
         if move % 4 == 0:
             picture = shoot(f"l05_drag_{move}")
             levels.append((colour_at(picture, left)[0], colour_at(picture, right).mean()))
-    yield DRAWN
-    last = check_picture("l06_after_drag")
+    last = yield from check_picture("l06_after_drag")
     lefts, rights = zip(*levels, strict=True)
     assert all(np.diff(lefts) > 0), f"the red wall does not brighten as the lamp comes near: {lefts}"
     assert all(np.diff(rights) < 0), f"the right wall does not darken as the lamp goes: {rights}"
-    redness = [colour_at(p, CORNER)[0] / colour_at(p, CORNER)[2] for p in (first, last)]
-    assert redness[1] > 1.05 * redness[0], f"the back beside the red wall does not redden: {redness}"
+    redness = [colour_at(last, place)[0] / colour_at(last, place)[2] for place in CORNERS]
+    assert redness[0] > 1.03 * redness[1], f"the red wall does not bleed on the back wall: {redness}"
 
 
 def follow_lamp() -> Step:
     """Power, colour and hiding are followed, each to what the CPU says."""
     energy = lamp().data.energy
     lamp().data.energy = 0.3 * energy
-    yield DRAWN
-    dim = check_picture("l07_dim")
+    dim = yield from check_picture("l07_dim")
     lamp().data.energy, lamp().data.color = energy, (0.2, 0.4, 1.0)
-    yield DRAWN
-    blue = check_picture("l08_blue")
+    blue = yield from check_picture("l08_blue")
     assert colour_at(blue, (0.0, 0.98, 1.6))[2] > 1.5 * colour_at(blue, (0.0, 0.98, 1.6))[0]
     lamp().data.color = (1.0, 1.0, 1.0)
     lamp().hide_render = lamp().hide_viewport = True
-    yield DRAWN
-    hidden = check_picture("l09_hidden")
+    hidden = yield from check_picture("l09_hidden")
     assert colour_at(hidden, (-0.98, 0.2, 0.9))[0] < colour_at(dim, (-0.98, 0.2, 0.9))[0]
     lamp().hide_render = lamp().hide_viewport = False
-    yield DRAWN
-    check_picture("l10_shown_again")
+    yield from check_picture("l10_shown_again")
 
 
 def play() -> Step:
@@ -259,14 +263,13 @@ def play() -> Step:
     lamp().keyframe_insert("location", frame=24)
     scene.frame_start, scene.frame_end = 1, 24
     scene.frame_set(1)
-    yield DRAWN
-    first = check_picture("l11_frame_1")
+    first = yield from check_picture("l11_frame_1")
     scene.frame_set(24)
-    yield DRAWN
-    assert np.abs(check_picture("l12_frame_24") - first.astype(float)).mean() > 1.0
+    last = yield from check_picture("l12_frame_24")
+    assert np.abs(last - first.astype(float)).mean() > 1.0
     scene.frame_set(1)
-    yield DRAWN
-    again = np.abs(at_vertices(shoot("l13_frame_1_again")) - at_vertices(first)).max()
+    back = yield from check_picture("l13_frame_1_again")
+    again = np.abs(at_vertices(back) - at_vertices(first)).max()
     assert again <= 1.0, f"frame 1 differs from itself by {again} levels"
     with override():
         bpy.ops.screen.animation_play()
@@ -280,8 +283,8 @@ def play() -> Step:
     assert len(frames) > 1, "the animation does not play"
     assert max(np.abs(p - pictures[0]).mean() for p in pictures) > 1.0, "the picture stands while the lamp moves"
     scene.frame_set(1)
-    yield DRAWN
-    again = np.abs(at_vertices(shoot("l15_after_play")) - at_vertices(first)).max()
+    back = yield from check_picture("l15_after_play")
+    again = np.abs(at_vertices(back) - at_vertices(first)).max()
     assert again <= 1.0, f"frame 1 after playing differs by {again} levels"
     lamp().animation_data_clear()
 
@@ -298,7 +301,7 @@ def lamp_outside() -> Step:
     lamp().location = place
     yield DRAWN
     assert not session().preview_message, session().preview_message
-    check_picture("l17_inside_again")
+    yield from check_picture("l17_inside_again")
 
 
 def cancel_in_lamps_stage() -> Step:
@@ -319,8 +322,7 @@ def cancel_in_lamps_stage() -> Step:
     assert len(jobs()) == 1 and not left_over(), left_over()
     finished = {p.name: p.stat().st_mtime_ns for p in jobs()[0].glob("*.npz")}
     assert {"gather.npz", "direct.npz", "interreflection.npz"} <= set(finished), finished
-    yield 0.5
-    check_picture("l19_cancelled")
+    yield from check_picture("l19_cancelled")
 
 
 def resume_after_kill() -> Step:
@@ -344,8 +346,7 @@ def resume_after_kill() -> Step:
     yield from wait_for_bake()
     assert not session().failed, session().message
     assert not jobs() and not children()
-    yield 2.0 * DRAWN
-    check_picture("l20_resumed")
+    yield from check_picture("l20_resumed")
 
 
 def both_kinds() -> Step:
@@ -356,15 +357,12 @@ def both_kinds() -> Step:
     invoke("merge_response=0.02")
     yield from wait_for_bake()
     assert not session().failed, session().message
-    yield 2.0 * DRAWN
-    with_sky = check_picture("l21_both")
+    with_sky = yield from check_picture("l21_both")
     background["Strength"].default_value = 0.05
-    yield DRAWN
-    dark_sky = check_picture("l22_both_dark_sky")
+    dark_sky = yield from check_picture("l22_both_dark_sky")
     assert dark_sky.mean() < with_sky.mean()
     lamp().location = (0.6, 0.1, 0.7)
-    yield DRAWN
-    check_picture("l23_both_lamp_moved")
+    yield from check_picture("l23_both_lamp_moved")
 
 
 STEPS = (open_room, bake_lamps, undo_and_redo, preview, drag, follow_lamp, play, lamp_outside, both_kinds,
