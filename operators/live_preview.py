@@ -33,6 +33,7 @@ SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
 STILL_SECONDS = 0.25  # after its last move a lamp counts as let go, and its soft shadows are refined
 NOTE_WAIT = 1.0  # after a redraw was asked for, its outcome is known
+OUTSIDE_LABEL = "outside the light cloud: no bounced light"
 SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
@@ -89,7 +90,7 @@ def enable() -> None:
     """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
     _read_bakes()
     _read_light()
-    viewport.enable(draw_list, shows_everything)
+    viewport.enable(draw_list, shows_everything, labels)
     assign(session(), preview=True, preview_message="")
 
 
@@ -122,6 +123,12 @@ def shows_everything() -> bool:
     return all(found.name in _live.shown or found.type not in SURFACE_TYPES or not found.visible_in_viewport_get(space)
                or found.display_type in ("BOUNDS", "WIRE")
                for found in bpy.context.view_layer.objects)
+
+
+def labels() -> list[tuple[str, tuple[float, ...]]]:
+    """What is written beside lamps: those outside of the cloud."""
+    outside = _live.lamps.outside
+    return [(OUTSIDE_LABEL, tuple(lamp.position)) for lamp in _live.lamps_read if lamp.name in outside]
 
 
 def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -76,6 +76,11 @@ class SceneLamps:
         return lamps
 
     @property
+    def outside(self) -> set[str]:
+        """Names of lamps that light without bounces."""
+        return {name for found in self._lit.values() for name in found.outside}
+
+    @property
     def settled(self) -> bool:
         """Whether nothing fades any more."""
         return all(found.settled for found in self._lit.values())

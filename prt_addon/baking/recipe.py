@@ -177,6 +177,7 @@ class _Bake:
             self._find_buried(transfer)
             signals = self._signals(transfer, glossy, subsurface)
             self._join_local(signals, local)
+            local = None
             self._choose_highlights(glossy, signals)
             glossy = None
             self._fill_buried(signals)

@@ -42,13 +42,13 @@ from driving import (
 OBJECTS = {"Floor", "Ceiling", "Back", "Left", "Right", "Box"}
 WALLS = ("Floor", "Back", "Left", "Right")
 # The job of the cancel tests: long enough in the lamps' stage to be met there.
-LONG = "cloud_lights=1200, merge_response=0, gather_directions=512, error_receivers=0"
+LONG = "cloud_lights=500, merge_response=0, gather_directions=512, error_receivers=0"
 LAMPS_STAGE = "Local lights"
 # Levels of 255 that a pixel may differ from the oracle in the mean, and all but a hundredth of the pixels: the vertex
 # lies up to half a pixel beside it.
 MEAN_LEVELS, MOST_LEVELS = 1.0, 6.0
 PATIENCE = 20.0  # seconds
-CORNERS = ((-0.85, 0.98, 1.7), (0.85, 0.98, 1.7))  # on the back wall, beside the red one and opposite
+FACES = ((-0.026, 0.133, 0.3), (0.367, -0.026, 0.3))  # of the box, towards the red wall and away from it
 
 
 def core(name: str) -> object:
@@ -106,24 +106,25 @@ def at_vertices(picture: np.ndarray) -> np.ndarray:
     return picture[row, column].astype(float)
 
 
-def differences(picture: np.ndarray, names: tuple[str, ...] = WALLS) -> np.ndarray:
-    """Levels (n, 3) by which a screenshot is brighter than the oracle at the vertices of these objects."""
+def differences(picture: np.ndarray, covered: range) -> np.ndarray:
+    """Levels (n, 3) by which a screenshot is brighter than the oracle at the walls' vertices in sight."""
     found = []
     for name, (positions, radiance) in oracle().items():
-        if name in names:
+        if name in WALLS:
             inner, pixel = seen(positions)
-            found.append(picture[pixel[:, 0], pixel[:, 1]].astype(float) - srgb(radiance[inner]))
+            off = picture[pixel[:, 0], pixel[:, 1]].astype(float) - srgb(radiance[inner])
+            found.append(off[~np.isin(pixel[:, 0], covered)])
     return np.concatenate(found)
 
 
-def check_picture(name: str) -> Generator[float, None, np.ndarray]:
+def check_picture(name: str, covered: range = range(0)) -> Generator[float, None, np.ndarray]:
     """A screenshot NAME.png that shows what the oracle says, soon: software drawing on a loaded machine takes its
-    time."""
+    time. covered: rows in front of which something else is."""
     started, before = time.monotonic(), None
     while True:
         yield 0.5
         picture = shoot(name)
-        off = differences(picture)
+        off = differences(picture, covered)
         mean, most = float(np.abs(off).mean()), float(np.percentile(np.abs(off).max(axis=1), 99.0))
         right, seconds = mean < MEAN_LEVELS and most < MOST_LEVELS, time.monotonic() - started
         right &= before is not None and np.abs(off - before).max() <= 1.0  # it has settled, too
@@ -131,7 +132,7 @@ def check_picture(name: str) -> Generator[float, None, np.ndarray]:
         if right or seconds > PATIENCE:
             break
     print(f"{name}: {len(off)} vertices, mean {off.mean():+.2f}, {mean:.2f} levels, 99 % below {most:.1f}, after "
-          f"{seconds:.1f} s", flush=True)
+          f"{seconds:.1f} s, moving {core('operators.live_preview')._live.moving}", flush=True)
     assert len(off) > 300, f"{name}: only {len(off)} vertices in sight"
     assert right, f"{name}: {mean:.2f} levels off in the mean, a hundredth {most:.1f} or more"
     return picture
@@ -215,7 +216,7 @@ def preview() -> Step:
         assert bpy.ops.prt.toggle_preview() == {"FINISHED"}
     for shading in ("SOLID", "MATERIAL"):
         area().spaces.active.shading.type = shading
-            yield from check_picture(f"l04_{shading.lower()}")
+        yield from check_picture(f"l04_{shading.lower()}")
     assert not session().preview_message, session().preview_message
 
 
@@ -231,12 +232,12 @@ def drag() -> Step:
         if move % 4 == 0:
             picture = shoot(f"l05_drag_{move}")
             levels.append((colour_at(picture, left)[0], colour_at(picture, right).mean()))
-    last = yield from check_picture("l06_after_drag")
+    yield from check_picture("l06_after_drag")
     lefts, rights = zip(*levels, strict=True)
     assert all(np.diff(lefts) > 0), f"the red wall does not brighten as the lamp comes near: {lefts}"
     assert all(np.diff(rights) < 0), f"the right wall does not darken as the lamp goes: {rights}"
-    redness = [colour_at(last, place)[0] / colour_at(last, place)[2] for place in CORNERS]
-    assert redness[0] > 1.03 * redness[1], f"the red wall does not bleed on the back wall: {redness}"
+    redness = [colour_at(first, place)[0] / colour_at(first, place)[2] for place in FACES]
+    assert redness[0] > 1.1 * redness[1], f"the red wall does not bleed on the box: {redness}"
 
 
 def follow_lamp() -> Step:
@@ -346,7 +347,7 @@ def resume_after_kill() -> Step:
     yield from wait_for_bake()
     assert not session().failed, session().message
     assert not jobs() and not children()
-    yield from check_picture("l20_resumed")
+    yield from check_picture("l20_resumed", range(440, 540))  # the error of the killed bake stands there until a load
 
 
 def both_kinds() -> Step:
