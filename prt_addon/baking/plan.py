@@ -43,7 +43,9 @@ COPIES_OF_SERIES, COPIES_OF_KRYLOV, BYTES_PER_BASE_VALUE = 5, 24, 20
 ENCODED_ROWS, COPIES_OF_ROWS, MOST_AXES = 4096, 4, 1024
 # Local lights: the share that is left of them after merging; of what is solved at once, copies of one channel; of
 # blocks of what highlights see of it, the largest temporary array, of which each thread has a few.
-TYPICAL_MERGED_SHARE, COPIES_OF_SOLVED, COPIES_OF_BLOCK = 0.5, 6, 3
+TYPICAL_MERGED_SHARE, LEAST_MERGED_SHARE, COPIES_OF_SOLVED, COPIES_OF_BLOCK = 0.5, 0.2, 6, 3
+# How much more the forecast of memory may say than what is taken.
+MOST_OVERRATED = 2.0
 # Smaller clusters cost more in bases, and in constants at each light change, than their points save.
 RECEIVERS_PER_CLUSTER = 24
 # Of matrices (highlights): receivers for each one in a basis, so that what is stored shrinks to half at most, and bytes
@@ -65,6 +67,7 @@ class Plan:
     seconds: dict[str, float]
     rays: dict[str, int]
     peak_bytes: int
+    least_bytes: int
     stored_bytes: int
     disk_bytes: int
 
@@ -113,7 +116,9 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
         rays["errors"] = (4 if glossy else 2) * settings.error_receivers * settings.error_paths
         seconds["errors"] = 0.1 + rays["errors"] / PATH_RAYS_PER_SECOND
     peak, disk = _memory(scene, settings, needs, surfaces, receivers)
-    return Plan(needs, surfaces, receivers, seconds, rays, peak, _stored(scene, settings, needs, surfaces), disk)
+    least = int(_memory(scene, settings, needs, surfaces, receivers, LEAST_MERGED_SHARE)[0] / MOST_OVERRATED)
+    stored = _stored(scene, settings, needs, surfaces)
+    return Plan(needs, surfaces, receivers, seconds, rays, peak, least, stored, disk)
 
 
 def _local_columns(settings: BakeSettings, share: float = TYPICAL_MERGED_SHARE) -> int:
@@ -143,8 +148,9 @@ def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
 
 
 def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan, receivers: int,
-            ) -> tuple[int, int]:
-    """Bytes at the peak of the largest stage, and on disk at the end of the last one."""
+            share: float = 1.0) -> tuple[int, int]:
+    """Bytes at the peak of the largest stage, and on disk at the end of the last one. share: of lights that is left
+    after merging, which nobody knows before."""
     glossy = int(surfaces.glossy_points(scene).sum())
     hits_each = settings.gather_directions / 2 * TYPICAL_HIT_SHARE if needs.bounces else 0.0
     operator, kept = receivers * hits_each * BYTES_PER_RAY_HIT, glossy * hits_each * BYTES_PER_KEPT_HIT
@@ -157,8 +163,8 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
     copies, second = (COPIES_OF_KRYLOV, 1.5 * operator) if slow else (COPIES_OF_SERIES, 0.5 * operator)
     if not settings.distant_light:
         rows = 0
-    local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions))
-    shapes = _shapes(scene, settings, needs, surfaces, 1.0)  # nobody knows before how many lights will merge
+    local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions), share)
+    shapes = _shapes(scene, settings, needs, surfaces, share)
     stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
               known + second + copies * transfer,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
@@ -179,11 +185,12 @@ class _LocalMemory:
     solving: float = 0.0
 
 
-def _local_memory(settings: BakeSettings, needs: Needs, receivers: int, glossy: int, functions: int) -> _LocalMemory:
-    """What local lights take, as if none would merge."""
+def _local_memory(settings: BakeSettings, needs: Needs, receivers: int, glossy: int, functions: int,
+                  share: float) -> _LocalMemory:
+    """What local lights take. share: of them that is left after merging."""
     if not settings.local_light:
         return _LocalMemory()
-    columns, channels = _local_columns(settings, 1.0), needs.channels
+    columns, channels = _local_columns(settings, share), needs.channels
     if not needs.bounces:
         return _LocalMemory(4 * receivers)
     kept = 4 * receivers * columns * channels + 4 * glossy * functions * columns * channels

@@ -51,6 +51,7 @@ from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
 from .local_budget import local_budget
 from .local_lights import LitHighlights, LocalTransfer, local_transfer, packed_local, unpacked_local
+from .memory import memory_warning
 from .plan import Plan, make_plan, most_clusters
 from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
 from .settings import BakeSettings
@@ -137,6 +138,7 @@ class _Bake:
         self.rays_resumed = 0
         self.tracer: Tracer | None = None
         self.plan: Plan = make_plan(self.scene, self.settings, self.light)
+        self.memory_warning = memory_warning(self.plan, self.settings)
         self.timer = StageTimer(lambda: self.tracer.rays if self.tracer else 0)
         self.stage_order = list(self.plan.seconds)
         with self.timer.stage("prepare"):
@@ -674,6 +676,8 @@ class _Bake:
                 report["errors"], report["local_errors"] = self.local_errors, {}
             report["headline"] = headline(report)
             report["scene"]["warnings"] += self.local.facts["warnings"]
+        if self.memory_warning:
+            report["scene"]["warnings"].append(f"Bake: {self.memory_warning}")
         if self.filled:
             note = (f"{plural(self.filled, 'receiver', 'receivers')} inside other objects"
                     f" {'takes its' if self.filled == 1 else 'take their'} neighbours' light")
