@@ -100,6 +100,12 @@ def disable() -> None:
     assign(session(), preview=False, preview_message="")
 
 
+def settled() -> bool:
+    """Whether nothing is left to be done: what was noted is evaluated, no light fades, no soft shadow is coarse."""
+    dirty = _live.bakes_dirty or _live.stale_dirty or (session().preview and _live.light_dirty)
+    return not dirty and not _live.moving
+
+
 def draw_list() -> list[DrawItem]:
     """What one region draws now: called on every redraw, so it only looks things up."""
     if _live.signature is None:
