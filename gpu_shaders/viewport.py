@@ -161,17 +161,20 @@ def _draw_labels() -> None:
     if viewport is None or region is None or not space.overlay.show_overlays:
         return
     scale, font = bpy.context.preferences.system.ui_scale, 0
+    sidebars = [other.width for other in bpy.context.area.regions if other.type == "UI" and other.width > 1]
+    blf.size(font, LABEL_SIZE * scale)
+    blf.enable(font, blf.SHADOW)
     for text, place in viewport.get_labels():
         where = location_3d_to_region_2d(region, bpy.context.region_data, Vector(place))
         if where is None:  # behind the viewer
             continue
-        blf.size(font, LABEL_SIZE * scale)
+        aside, width = LABEL_OFFSET[0] * scale, blf.dimensions(font, text)[0]
+        fits = where.x + aside + width < region.width - sum(sidebars)
         blf.color(font, 1.0, 0.75, 0.2, 1.0)
-        blf.enable(font, blf.SHADOW)
         blf.shadow(font, 3, 0.0, 0.0, 0.0, 0.9)
-        blf.position(font, where.x + LABEL_OFFSET[0] * scale, where.y + LABEL_OFFSET[1] * scale, 0.0)
+        blf.position(font, where.x + aside if fits else where.x - aside - width, where.y + LABEL_OFFSET[1] * scale, 0.0)
         blf.draw(font, text)
-        blf.disable(font, blf.SHADOW)
+    blf.disable(font, blf.SHADOW)
 
 
 def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu.types.GPUFrameBuffer | None) -> None:

@@ -146,6 +146,10 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
         if not session.objects:
             layout.label(text="Nothing is baked yet", icon="INFO")
             return
+        if session.cloud:
+            box = layout.box().column(align=True)
+            for number, line in enumerate(session.cloud.splitlines()):
+                box.label(text=line, icon="BLANK1" if number else "LIGHT")
         column = layout.box().column(align=True)
         for line in session.objects[:ROWS]:
             row = column.row()
@@ -157,10 +161,6 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
                 wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
         if len(session.objects) > ROWS:
             column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
-        if session.cloud:
-            box = layout.box().column(align=True)
-            for number, line in enumerate(session.cloud.splitlines()):
-                box.label(text=line, icon="BLANK1" if number else "LIGHT")
         layout.operator("prt.clear", icon="TRASH")
 
 

@@ -37,6 +37,7 @@ from driving import (
     start,
     until,
     wait_for_bake,
+    window,
 )
 
 OBJECTS = {"Floor", "Ceiling", "Back", "Left", "Right", "Box"}
@@ -294,9 +295,14 @@ def lamp_outside() -> Step:
     place = Vector(lamp().location)
     lamp().location = (1.6, 0.0, 1.4)
     area().spaces.active.overlay.show_overlays = True
+    bpy.context.view_layer.objects.active = lamp()
+    properties = next(a for a in window().screen.areas if a.type == "PROPERTIES").spaces.active
+    yield 0.5
+    properties.context = "DATA"
     yield DRAWN
     assert "Lamp" in session().preview_message and "outside" in session().preview_message, session().preview_message
     shoot("l16_outside")
+    properties.context = "OBJECT"
     area().spaces.active.overlay.show_overlays = False
     lamp().location = place
     yield DRAWN
