@@ -72,6 +72,8 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
         errors={name: entry["relative_rms"] for name, entry in report["errors"].items()},
         highlight_errors={name: entry["relative_rms"] for name, entry in report["highlight_errors"].items()},
         local_errors={name: entry["relative_rms"] for name, entry in (report.get("local_errors") or {}).items()},
+        local_highlight_errors={name: entry["relative_rms"]
+                                for name, entry in (report.get("local_highlight_errors") or {}).items()},
         own_errors={part: errors[target.name] for part in PARTS
                     if target.name in (errors := object_errors(report, part))},
         coherence=report["clusters"]["objects"][target.name].get("coherence"),

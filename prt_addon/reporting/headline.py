@@ -9,7 +9,8 @@ from .svg_plots import percent
 
 Report = dict[str, Any]
 # What is measured -> the key of its entries in a report.
-PARTS = {"diffuse": "errors", "highlights": "highlight_errors", "bounced light of lamps": "local_errors"}
+PARTS = {"diffuse": "errors", "highlights": "highlight_errors", "bounced light of lamps": "local_errors",
+         "highlights of lamps": "local_highlight_errors"}
 
 
 def headline(report: Report) -> str:

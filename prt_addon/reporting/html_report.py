@@ -122,7 +122,8 @@ def _errors(report: Report) -> str:
     of_lamps = ("Bounced light of lamps", wording.LOCAL_ERRORS)
     diffuse = of_lamps if report["settings"].get("lighting") == "local" else ("Diffuse light", wording.ERRORS)
     for (title, words), key in ((diffuse, "errors"), (("Highlights", wording.HIGHLIGHT_ERRORS), "highlight_errors"),
-                                (of_lamps, "local_errors")):
+                                (of_lamps, "local_errors"),
+                                (("Highlights under lamps", wording.LOCAL_HIGHLIGHT_ERRORS), "local_highlight_errors")):
         if report.get(key):
             parts += [f"<h3>{title}</h3>", *_budget(report[key], words, title)]
     if not parts:
@@ -160,6 +161,8 @@ def _errors_of_objects(report: Report) -> str:
              "Highlights": object_errors(report, "highlights")}
     if report.get("local_errors"):
         found["Lamps"] = object_errors(report, "bounced light of lamps")
+    if report.get("local_highlight_errors"):
+        found["Highlights under lamps"] = object_errors(report, "highlights of lamps")
     names = list(dict.fromkeys(name for errors in found.values() for name in errors))
     if len(names) < 2:
         return ""

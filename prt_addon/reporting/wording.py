@@ -54,6 +54,18 @@ HIGHLIGHT_ERRORS = {
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
 }
 
+# The same for highlights under lamps.
+LOCAL_HIGHLIGHT_ERRORS = {
+    "total": ("All together", "what highlights show of the surfaces that a lamp shines on, against a full simulation "
+              "with the materials' own reflection", ""),
+    "baked": ("As baked", "a limited number of rays, the cloud's lights around the lamp, and the smooth functions of "
+              "the view", "more gather_directions, cloud_lights or glossy_rows"),
+    "bounces": ("Reflections in reflections", "in what highlights show, further reflections are spread evenly", ""),
+    "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
+    "direct": ("The lamp itself", "its own highlight, which no bake holds, is shown with the same smooth functions of "
+               "the view; not part of all together", "more glossy_rows"),
+}
+
 # Upper end of each zone on the error plot and its name; a relative RMS of 1 % is about 2.5 of 255 grey levels at most.
 ZONES = ((0.01, "hard to see"), (0.05, "slight"), (1.0, "visible"))
 
