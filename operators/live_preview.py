@@ -168,7 +168,7 @@ def _read_bakes() -> None:
             continue
         line.clusters, line.points = int(baked.bases.shape[0]), len(baked.cluster)
         coherence = baked.header.get("coherence") or {}
-        line.error, line.highlight_error, line.lamp_error = _errors_of(baked)
+        line.error, line.highlight_error, line.lamp_error, line.lamp_highlight_error = _errors_of(baked)
         line.overdraw = float(coherence.get("both", 0.0))
         line.overdraw_before = float(coherence.get("before", 0.0))
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
@@ -180,8 +180,9 @@ def _read_bakes() -> None:
     _read_stale()
 
 
-def _errors_of(baked: BakedTransfer) -> tuple[float, float, float]:
-    """Measured errors of diffuse light, highlights and lamps' bounced light; -1 for what was not measured.
+def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
+    """Measured errors of diffuse light, highlights, lamps' bounced light and highlights of that; -1 for what was not
+    measured.
 
     The object's own errors; where it had too few points to measure one, those of the whole bake.
     """
@@ -189,7 +190,8 @@ def _errors_of(baked: BakedTransfer) -> tuple[float, float, float]:
     only_lamps = header.get("settings", {}).get("lighting") == "local"
     keys = {"diffuse": None if only_lamps else "errors",
             "highlights": "highlight_errors" if baked.functions else None,
-            "bounced light of lamps": "errors" if only_lamps else "local_errors"}
+            "bounced light of lamps": "errors" if only_lamps else "local_errors",
+            "highlights of lamps": "local_highlight_errors" if baked.functions else None}
     found = []
     for part, key in keys.items():
         mine = own.get("diffuse" if only_lamps and key == "errors" else part) if key else None

@@ -188,6 +188,7 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     error: FloatProperty(default=-1.0)
     highlight_error: FloatProperty(default=-1.0)
     lamp_error: FloatProperty(default=-1.0)
+    lamp_highlight_error: FloatProperty(default=-1.0)
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
     error_spent: FloatProperty()

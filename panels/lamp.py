@@ -23,7 +23,7 @@ class PRT_PT_lamp(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         for note in _notes(context):
-            wrapped(self.layout, context, note, "ERROR")
+            wrapped(self.layout, context, note[0].upper() + note[1:], "ERROR")
 
 
 def _notes(context: bpy.types.Context) -> list[str]:

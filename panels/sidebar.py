@@ -167,9 +167,9 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
 def _details(line: bpy.types.PropertyGroup) -> list[str]:
     """What came out for one object, in short lines."""
     lines = [_plural(line.clusters, "cluster")] * bool(line.clusters)
-    lines += [f"{part} error {100.0 * value:.2f} %"
-              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlight"),
-                                  (line.lamp_error, "lamps\u2019")) if value >= 0.0]
+    errors = ((line.error, "diffuse"), (line.highlight_error, "highlight"), (line.lamp_error, "lamps'"),
+              (line.lamp_highlight_error, "lamps' highlight"))
+    lines += [f"{part} error {100.0 * value:.2f} %" for value, part in errors if value >= 0.0]
     if line.overdraw > 0.0:
         lines.append(f"overdraw {line.overdraw_before:.2f} to {line.overdraw:.2f}")
         lines.append(f"for {100.0 * line.error_spent:.1f} % of squared error")

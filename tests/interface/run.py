@@ -114,6 +114,44 @@ def check_interrupt(blender: Blender, scene: Path) -> None:
     assert not output.exists()
 
 
+def check_kill_among_lamps(blender: Blender, scene: Path) -> None:
+    """Blender is killed while its child bakes local lights: the child ends and cleans up, and the next bake resumes."""
+    output, report = blender.output / "killed.blend", blender.output / "killed.json"
+    command = ("--command", "prt", "bake", "--input", str(scene), "--output", str(output), "--report", str(report),
+               "--preset", "draft", "--lighting", "local", "--set", "cloud_region=Region", "--set", "cloud_lights=300",
+               "--set", "merge_response=0", "--set", "error_receivers=0", "--set", "spacing=0.02")
+    running = blender.start_command(*command)
+    for line in running.stderr:
+        if "Local lights" in line:
+            break
+    jobs = Path(blender.environment["BLENDER_USER_RESOURCES"])
+    deadline = time.monotonic() + 30.0
+    while not list(jobs.rglob("responses-*")):
+        assert time.monotonic() < deadline and running.poll() is None, "no responses on disk"
+        time.sleep(0.02)
+    os.kill(blender_process(output), signal.SIGKILL)
+    running.communicate(timeout=30)
+    assert running.returncode != 0 and not output.exists()
+    while left := [*jobs.rglob("responses-*"), *jobs.rglob("bake-*/.*.part")]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.1)
+    done = blender.command(*command)
+    assert done.returncode == 0, done.stderr
+    resumed = json.loads(report.read_text())["resumed"]
+    assert resumed == ["gather", "direct", "interreflection"], resumed
+
+
+def blender_process(output: Path) -> int:
+    """The number of the Blender that writes this file: what was started may be a wrapper around it."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if (folder / "comm").read_text() == "blender\n" and str(output).encode() in (folder / "cmdline").read_bytes():
+                return int(folder.name)
+        except OSError:  # it ended meanwhile
+            continue
+    raise AssertionError("Blender is not running")
+
+
 def interface_results(blender: Blender, script: str, results: str, scene: Path) -> list[tuple[str, str]]:
     """Name and failure (empty: passed) of each step that a script took."""
     results = blender.output / results
@@ -158,6 +196,7 @@ def main() -> int:
             scene = make_scene(blender, "make_scene.py", outcomes)
             outcomes += [run_check(check, blender, scene)
                          for check in (check_bad_arguments, check_command_bake, check_interrupt)]
+            outcomes.append(run_check(check_kill_among_lamps, blender, make_scene(blender, "make_room.py", outcomes)))
         for name, (script, maker) in SCRIPTS.items():
             if arguments.only in (None, name):
                 outcomes += interface_results(blender, script, f"{name}.json", make_scene(blender, maker, outcomes))
