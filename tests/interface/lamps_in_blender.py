@@ -49,6 +49,7 @@ LAMPS_STAGE = "Local lights"
 # lies up to half a pixel beside it.
 MEAN_LEVELS, MOST_LEVELS = 1.0, 6.0
 OTHERS: set[Path] = set()
+BUBBLE = range(440, 540)  # rows: the error of a killed bake stands there until a file is loaded
 PATIENCE = 20.0  # seconds
 FACES = ((-0.026, 0.133, 0.3), (0.367, -0.026, 0.3))  # of the box, towards the red wall and away from it
 
@@ -63,7 +64,7 @@ def lamp(name: str = "Lamp") -> bpy.types.Object:
 
 
 def oracle() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By name: positions (p, 3) and radiance (p, 3) towards the normal under the scene's light, from the CPU alone."""
+    """By name: positions (p, 3) and radiance (p, 3) towards the camera under the scene's light, from the CPU alone."""
     stored, scene_light = core("prt_addon.blender.stored"), core("prt_addon.relighting.scene_light")
     relit, lamps_of = core("prt_addon.relighting.exit_radiance"), core("operators.scene_lamps").SceneLamps()
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -75,7 +76,8 @@ def oracle() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     for name, transfer in baked.items():
         light = scene_light.joined_light(transfer.lighting_basis, distant, lamps_of.cloud_light(transfer))
         direct = lamps_of.direct(name, transfer, lamps)
-        result[name] = transfer.positions, relit.view_radiance(transfer, light, transfer.normals, direct)
+        views = np.array(bpy.context.scene.camera.location) - transfer.positions
+        result[name] = transfer.positions, relit.view_radiance(transfer, light, views, direct)
     return result
 
 
@@ -91,7 +93,7 @@ def seen(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     clip = np.c_[positions, np.ones(len(positions))] @ matrix.T
     place = 0.5 * clip[:, :2] / clip[:, 3:] + 0.5
     column, row = box.x + place[:, 0] * box.width, 999 - (box.y + place[:, 1] * box.height)
-    inner = (np.abs(positions - (0.0, 0.0, 1.0)) < 0.9).sum(axis=1) >= 2
+    inner = (np.abs(positions - (0.0, 0.0, 1.0)) < 0.9).sum(axis=1) >= 2  # edges show either wall
     eye, depsgraph = bpy.context.scene.camera.location, bpy.context.evaluated_depsgraph_get()
     for index in np.flatnonzero(inner):
         ray = Vector(positions[index]) - eye
@@ -108,33 +110,34 @@ def at_vertices(picture: np.ndarray) -> np.ndarray:
     return picture[row, column].astype(float)
 
 
-def differences(picture: np.ndarray, covered: range) -> np.ndarray:
-    """Levels (n, 3) by which a screenshot is brighter than the oracle at the walls' vertices in sight."""
+def differences(picture: np.ndarray, covered: range, names: tuple[str, ...]) -> np.ndarray:
+    """Levels (n, 3) by which a screenshot is brighter than the oracle at these objects' vertices in sight."""
     found = []
     for name, (positions, radiance) in oracle().items():
-        if name in WALLS:
+        if name in names:
             inner, pixel = seen(positions)
             off = picture[pixel[:, 0], pixel[:, 1]].astype(float) - srgb(radiance[inner])
             found.append(off[~np.isin(pixel[:, 0], covered)])
     return np.concatenate(found)
 
 
-def check_picture(name: str, covered: range = range(0)) -> Generator[float, None, np.ndarray]:
+def check_picture(name: str, covered: range = range(0), names: tuple[str, ...] = WALLS,
+                  ) -> Generator[float, None, np.ndarray]:
     """A screenshot NAME.png that shows what the oracle says, soon: software drawing on a loaded machine takes its
-    time. covered: rows in front of which something else is."""
+    time. covered: rows in front of which something else is; names: of the objects that are looked at."""
     started, live = time.monotonic(), core("operators.live_preview")
     while True:
         settled = live.settled()
         yield 0.5
         picture = shoot(name)
-        off = differences(picture, covered)
+        off = differences(picture, covered, names)
         mean, most = float(np.abs(off).mean()), float(np.percentile(np.abs(off).max(axis=1), 99.0))
         right, seconds = settled and mean < MEAN_LEVELS and most < MOST_LEVELS, time.monotonic() - started
         if right or seconds > PATIENCE:
             break
     print(f"{name}: {len(off)} vertices, mean {off.mean():+.2f}, {mean:.2f} levels, 99 % below {most:.1f}, after "
           f"{seconds:.1f} s", flush=True)
-    assert len(off) > 300, f"{name}: only {len(off)} vertices in sight"
+    assert len(off) > 100, f"{name}: only {len(off)} vertices in sight"
     assert right, f"{name}: {mean:.2f} levels off in the mean, a hundredth {most:.1f} or more"
     return picture
 
@@ -315,6 +318,35 @@ def lamp_outside() -> Step:
     yield from check_picture("l17_inside_again")
 
 
+def metal_under_lamps() -> Step:
+    """A ball of gold shows the lamps and what they shine on: as the CPU says for the camera's views."""
+    settings, gold = bpy.context.scene.prt, bpy.data.materials["Box"]
+    shader = gold.node_tree.nodes["Principled BSDF"].inputs
+    shader["Base Color"].default_value, shader["Metallic"].default_value = (0.9, 0.7, 0.3, 1.0), 1.0
+    shader["Roughness"].default_value = 0.5
+    bpy.data.objects["Box"].hide_render = bpy.data.objects["Box"].hide_viewport = True
+    with override():
+        bpy.ops.mesh.primitive_uv_sphere_add(segments=48, ring_count=24, radius=0.45, location=(0.1, 0.0, 0.5))
+        bpy.ops.object.shade_smooth()
+    ball = bpy.context.view_layer.objects.active
+    ball.name = "Ball"
+    ball.data.materials.append(gold)
+    ball.select_set(False)
+    settings.lighting, settings.glossy_rows = "local", "9"
+    lamp().location = (-0.5, -0.6, 1.5)
+    invoke("merge_response=0.05, cloud_lights=27")
+    yield from wait_for_bake()
+    assert not session().failed, session().message
+    assert "highlights of lamps" in session().message, session().message
+    yield from check_picture("l25_gold", BUBBLE, ("Ball",))
+    lamp().location = (0.6, -0.6, 1.2)
+    yield from check_picture("l26_gold_lamp_moved", BUBBLE, ("Ball",))
+    assert session().objects["Ball"].lamp_highlight_error >= 0.0
+    bpy.data.objects.remove(ball)
+    bpy.data.objects["Box"].hide_render = bpy.data.objects["Box"].hide_viewport = False
+    shader["Metallic"].default_value = 0.0
+
+
 def colour_attribute() -> Step:
     """The light of this moment as a colour attribute, one undo step, on all meshes that carry a bake."""
     with override():
@@ -379,7 +411,7 @@ def resume_after_kill() -> Step:
     yield from wait_for_bake()
     assert not session().failed, session().message
     assert not jobs() and not children()
-    yield from check_picture("l20_resumed", range(440, 540))  # the error of the killed bake stands there until a load
+    yield from check_picture("l20_resumed", BUBBLE)
 
 
 def both_kinds() -> Step:
@@ -399,6 +431,6 @@ def both_kinds() -> Step:
 
 
 STEPS = (open_room, bake_lamps, undo_and_redo, preview, drag, follow_lamp, play, lamp_outside, both_kinds,
-         colour_attribute, cancel_in_lamps_stage, resume_after_kill)
+         colour_attribute, cancel_in_lamps_stage, resume_after_kill, metal_under_lamps)
 
 start(STEPS, "lamps")

@@ -145,7 +145,8 @@ def blender_process(output: Path) -> int:
     """The number of the Blender that writes this file: what was started may be a wrapper around it."""
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            if (folder / "comm").read_text() == "blender\n" and str(output).encode() in (folder / "cmdline").read_bytes():
+            name, command = (folder / "comm").read_text(), (folder / "cmdline").read_bytes()
+            if name == "blender\n" and str(output).encode() in command:
                 return int(folder.name)
         except OSError:  # it ended meanwhile
             continue
