@@ -81,7 +81,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   "channels": plan.needs.channels, "order": plan.needs.order},
         "left_out": [asdict(item) for item in plan.needs.left_out],
         "hints": list(plan.needs.hints),
-        "warnings": [*scene.warnings, *left_out, *([f"Bake: {too_much}"] if too_much else [])],
+        "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *left_out],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
         "rays": sum(plan.rays.values()),
@@ -97,7 +97,9 @@ def analysis_lines(analysis: dict[str, Any]) -> list[str]:
              f"{analysis['peak_bytes'] / 1e6:.0f} MB of memory and {analysis['disk_bytes'] / 1e6:.0f} MB of disk while "
              f"baking, {analysis['stored_bytes'] / 1e6:.1f} MB stored"]
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
-    return lines + analysis["hints"] + analysis["warnings"]
+    told = [line for line in analysis["warnings"] if line.startswith("Bake: ")]  # of memory: first, as it may end it
+    rest = [line for line in analysis["warnings"] if line not in told]
+    return lines[:1] + told + lines[1:] + analysis["hints"] + rest
 
 
 @dataclass

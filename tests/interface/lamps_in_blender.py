@@ -260,7 +260,9 @@ def follow_lamp() -> Step:
     lamp().hide_render = lamp().hide_viewport = True
     hidden = yield from check_picture("l09_hidden")
     assert colour_at(hidden, (-0.98, 0.2, 0.9))[0] < colour_at(dim, (-0.98, 0.2, 0.9))[0]
-    lamp().hide_render = lamp().hide_viewport = False
+    lamp().hide_viewport = False  # a render decides
+    yield from check_picture("l09_hidden_in_renders")
+    lamp().hide_render = False
     yield from check_picture("l10_shown_again")
 
 
