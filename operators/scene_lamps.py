@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
+from ..prt_addon.blender.visibility import render_visible_objects
 from ..prt_addon.lighting.light_cloud import LightCloud
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.lamp_light import (
@@ -29,6 +30,7 @@ from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
 from ..prt_addon.tracing.tracer import Tracer
 
+HIDDEN = "Lamps: all objects that are baked for them are hidden in renders, so they light nothing"
 OUTSIDE = "{}: outside the light cloud, so it is shown without bounced light"
 UNLIT = "{}: too far from the light cloud's lights in sight for part of the scene's bounced light"
 
@@ -58,9 +60,15 @@ class SceneLamps:
         near = {name: b for name, b in baked.items() if b.cloud is not None}
         if not near:
             return []
+        visible = {found.name for found in render_visible_objects(depsgraph.view_layer).values()}
+        casting = [name for name in near if name in visible]
+        if not casting:
+            self._lit = {}
+            warnings.append(HIDDEN)
+            return []
         lamps = read_local_lights(depsgraph, warnings)
         if self._tracer is None:
-            scene = SceneMesh.assemble(read_objects(depsgraph, list(near), []), 0.0)
+            scene = SceneMesh.assemble(read_objects(depsgraph, casting, []), 0.0)
             # In Blender's own process nothing starts threads (design/architecture.md).
             self._tracer = Tracer(scene.points, scene.triangles, threads=1)
         self._lit = {}
@@ -97,6 +105,8 @@ class SceneLamps:
         moving: keys of lamps that are being dragged, whose soft shadows may be coarse.
         """
         if baked.cloud is None:
+            return None
+        if self._tracer is None:
             return None
         if name not in self._direct:
             self._direct[name] = DirectLight(self._tracer, baked)
