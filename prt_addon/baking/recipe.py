@@ -54,7 +54,15 @@ from .local_highlight_budget import local_highlight_budget
 from .local_lights import LitHighlights, LocalTransfer, local_transfer, packed_local, unpacked_local
 from .memory import memory_warning
 from .plan import Plan, make_plan, most_clusters
-from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
+from .results import (
+    LocalColumns,
+    lamps_covered,
+    object_container,
+    report_of,
+    stability_of,
+    surface_checks,
+    white_world_checks,
+)
 from .settings import BakeSettings
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
@@ -710,6 +718,8 @@ class _Bake:
             if not self.settings.distant_light:
                 report["errors"], report["local_errors"] = self.local_errors, {}
             report["headline"] = headline(report)
+            if self.local_errors:
+                report["covers"] += lamps_covered(self.local_highlight_errors)
             report["scene"]["warnings"] += self.local.facts["warnings"]
         if self.memory_warning:
             report["scene"]["warnings"].append(f"Bake: {self.memory_warning}")

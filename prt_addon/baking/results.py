@@ -233,6 +233,16 @@ def _covers(scene: SceneMesh, plan: Plan, measured: dict[str, Any]) -> list[str]
     return found
 
 
+def lamps_covered(highlight_errors: dict[str, Any]) -> list[str]:
+    """The same for a bake with a light cloud. highlight_errors: of highlights under lamps, empty if not measured."""
+    found = ["Lamps: light that bounced, of a lamp at places between the cloud's lights, clear of surfaces. Its direct "
+             "light is not baked but found exactly, but for the steps of soft shadows"]
+    if highlight_errors:
+        found.append("Highlights under lamps: what they show of surfaces that the lamp shines on; the lamp's own "
+                     "highlight is measured apart from the total")
+    return found
+
+
 def _windowing(light: ReferenceLight | None, order: int, left_out: list[LeftOut]) -> dict[str, Any] | None:
     """What a window against ringing would do to the scene's present light; None without light.
 

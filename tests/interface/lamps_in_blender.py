@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Generator
@@ -248,6 +249,40 @@ def drag() -> Step:
     assert redness[0] > 1.1 * redness[1], f"the red wall does not bleed on the box: {redness}"
 
 
+def drag_by_mouse() -> Step:
+    """G and the mouse: the picture follows while the button is not yet pressed, and stays after the click."""
+    for scene_object in bpy.context.scene.objects:
+        scene_object.select_set(scene_object == lamp())
+    bpy.context.view_layer.objects.active = lamp()
+    with override():
+        bpy.ops.ed.undo_push(message="before the drag")
+    box, place = region(), Vector(lamp().location)
+    column, row = box.x + box.width // 3, 600
+    hand("mousemove", column, row)
+    yield 0.5
+    hand("key", "g")
+    yield 0.5
+    for _ in range(5):
+        column += 30
+        hand("mousemove", column, row)
+        yield 0.3
+    yield from until(lambda: lamp().location.x > place.x + 0.1, f"the lamp is not dragged: {lamp().location}")
+    yield from check_picture("l06_held_by_mouse")
+    hand("click", 1)
+    yield 0.5
+    assert lamp().location.x > place.x + 0.1
+    yield from check_picture("l06_let_go")
+    hand("mousemove", column, row, "key", "ctrl+z")
+    yield from until(lambda: (lamp().location - place).length < 1e-4, "undo does not put the lamp back")
+    yield from check_picture("l06_undone")
+    lamp().select_set(False)
+
+
+def hand(*arguments: object) -> None:
+    """Mouse and keyboard."""
+    subprocess.run(["xdotool", *map(str, arguments)], check=True, timeout=30)
+
+
 def follow_lamp() -> Step:
     """Power, colour and hiding are followed, each to what the CPU says."""
     energy = lamp().data.energy
@@ -432,7 +467,7 @@ def both_kinds() -> Step:
     yield from check_picture("l23_both_lamp_moved")
 
 
-STEPS = (open_room, bake_lamps, undo_and_redo, preview, drag, follow_lamp, play, lamp_outside, both_kinds,
-         colour_attribute, cancel_in_lamps_stage, resume_after_kill, metal_under_lamps)
+STEPS = (open_room, bake_lamps, undo_and_redo, preview, drag, drag_by_mouse, follow_lamp, play, lamp_outside,
+         both_kinds, colour_attribute, cancel_in_lamps_stage, resume_after_kill, metal_under_lamps)
 
 start(STEPS, "lamps")
