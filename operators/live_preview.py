@@ -174,10 +174,22 @@ def _read_bakes() -> None:
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
         line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
         _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)))
-    clouds = {cloud_key(shown.baked): cloud_lines(shown.baked.cloud) for shown in _live.shown.values()
-              if shown.baked.cloud is not None}
-    assign(state, cloud="\n".join(clouds.values()))
+    assign(state, cloud="\n".join(_cloud_lines()))
     _read_stale()
+
+
+def _cloud_lines() -> list[str]:
+    """What the light clouds of the bakes are; with their objects where there are several."""
+    owners: dict[str, list[str]] = {}
+    for name, shown in _live.shown.items():
+        if shown.baked.cloud is not None:
+            owners.setdefault(cloud_key(shown.baked), []).append(name)
+    lines = []
+    for names in owners.values():
+        if len(owners) > 1:
+            lines.append(f"{names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}:")
+        lines += cloud_lines(_live.shown[names[0]].baked.cloud).splitlines()
+    return lines
 
 
 def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
