@@ -133,7 +133,7 @@ def shows_everything() -> bool:
 
 def labels() -> list[tuple[str, tuple[float, ...]]]:
     """What is written beside lamps: those outside of the cloud."""
-    outside = _live.lamps.outside
+    outside = _live.lamps.outside if _live.shown else set()
     return [(OUTSIDE_LABEL, tuple(lamp.position)) for lamp in _live.lamps_read if lamp.name in outside]
 
 

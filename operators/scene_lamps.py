@@ -59,6 +59,7 @@ class SceneLamps:
         """
         near = {name: b for name, b in baked.items() if b.cloud is not None}
         if not near:
+            self._lit = {}
             return []
         visible = {found.name for found in render_visible_objects(depsgraph.view_layer).values()}
         casting = [name for name in near if name in visible]
@@ -100,13 +101,11 @@ class SceneLamps:
 
     def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
                moving: Container[str] = ()) -> NDArray[np.float32] | None:
-        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud.
+        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud, or before `step`.
 
         moving: keys of lamps that are being dragged, whose soft shadows may be coarse.
         """
-        if baked.cloud is None:
-            return None
-        if self._tracer is None:
+        if baked.cloud is None or self._tracer is None:
             return None
         if name not in self._direct:
             self._direct[name] = DirectLight(self._tracer, baked)
