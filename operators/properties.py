@@ -187,6 +187,8 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     points: IntProperty()
     error: FloatProperty(default=-1.0)
     highlight_error: FloatProperty(default=-1.0)
+    lamp_error: FloatProperty(default=-1.0)
+    lamp_highlight_error: FloatProperty(default=-1.0)
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
     error_spent: FloatProperty()
@@ -206,6 +208,7 @@ class PRTSession(bpy.types.PropertyGroup):
     preview_message: StringProperty()
     viewport_message: StringProperty()
     objects: CollectionProperty(type=PRTBakedObject)
+    cloud: StringProperty()
     analysis: StringProperty()
 
 

@@ -23,7 +23,7 @@ from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.path_reference import PointLights, reference_radiance
 from ..transport.receiver_set import ReceiverSet
-from .error_budget import summary
+from .error_budget import by_object, summary
 
 # Places of a lamp that the budget looks at, and how near to a surface they may be, in spacings of the cloud: nearer,
 # all light comes from one small bright spot, which no cloud and few rays can follow.
@@ -50,11 +50,13 @@ def probe_positions(tracer: Tracer, cloud: LightCloud, seed: int) -> NDArray[np.
 def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], keys: NDArray[np.int64],
                  cloud: LightCloud, zone: NDArray[np.int32], probes: Probes, transfer: NDArray[np.float64],
                  compressed: NDArray[np.float64], bounces: int, paths: int, seed: int,
+                 objects: NDArray[np.int64] | None = None, names: tuple[str, ...] = (),
                  ) -> Generator[float, None, dict[str, Any]]:
     """Yield progress, return {"sampling", "basis", "compression", "total"}: each as in `error_budget`, over receivers,
     places and channels.
 
-    keys: (k,) of receivers; zone: (k,) theirs; transfer, compressed: (k, columns, channels) before and after.
+    keys: (k,) of receivers; zone: (k,) theirs; objects: (k,) number of the object that each belongs to, names: of
+    objects, where the total is to be told of each; transfer, compressed: (k, columns, channels) before and after.
     """
     receivers = ReceiverSet.of_keys(scene, tracer, keys)
     place = np.searchsorted(keys, receivers.key)
@@ -82,7 +84,11 @@ def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
     def entry(squared: NDArray[np.float64], reference_rays: int) -> dict[str, Any]:
         return summary(np.sum(squared * alike, axis=(1, 2)), power, reference_rays, seed)
 
-    return {"sampling": entry((solved - first) * (solved - second), rays),
+    found = {"sampling": entry((solved - first) * (solved - second), rays),
             "basis": entry((interpolated - solved) ** 2, 0),
             "compression": entry((drawn - interpolated) ** 2, 0),
             "total": entry((drawn - first) * (drawn - second), rays)}
+    if objects is not None:
+        squared = np.sum((drawn - first) * (drawn - second) * alike, axis=(1, 2))
+        found["total"]["objects"] = by_object(squared, power, objects[place], names, seed)
+    return found

@@ -34,13 +34,12 @@ from ..transport.gather import Gather
 from ..transport.glossy import GlossySurfaces, reflected_light
 from ..transport.incident_light import DiffuseRadiance, IndirectLight
 from ..transport.local_lights import LightSolver
+from .leftovers import RESPONSES
 from .local_budget import Probes, probe_positions
 from .settings import BakeSettings
 
 # Parts of the progress that end with: the first solutions, merging (the rest: solutions at the merged places).
 SOLVED, MERGED, PROBED = 0.6, 0.7, 0.95
-# Name of the folder of responses on disk begins so.
-RESPONSES = "responses-"
 # Order of directional emission where the scene has lamps that need one: it costs four times an isotropic cloud, and
 # tells a spot's light before it from that behind it.
 ORDER_OF_SPOTS = 2

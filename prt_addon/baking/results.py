@@ -71,6 +71,9 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
         settings=settings.as_dict(),
         errors={name: entry["relative_rms"] for name, entry in report["errors"].items()},
         highlight_errors={name: entry["relative_rms"] for name, entry in report["highlight_errors"].items()},
+        local_errors={name: entry["relative_rms"] for name, entry in (report.get("local_errors") or {}).items()},
+        local_highlight_errors={name: entry["relative_rms"]
+                                for name, entry in (report.get("local_highlight_errors") or {}).items()},
         own_errors={part: errors[target.name] for part in PARTS
                     if target.name in (errors := object_errors(report, part))},
         coherence=report["clusters"]["objects"][target.name].get("coherence"),
@@ -227,6 +230,16 @@ def _covers(scene: SceneMesh, plan: Plan, measured: dict[str, Any]) -> list[str]
     if any(part.kernel is None and part.highlight.max() > 0.0 for part in used):
         found.append("Highlights that were left out are not part of it; what was left out says how much light they "
                      "return")
+    return found
+
+
+def lamps_covered(highlight_errors: dict[str, Any]) -> list[str]:
+    """The same for a bake with a light cloud. highlight_errors: of highlights under lamps, empty if not measured."""
+    found = ["Lamps: light that bounced, of a lamp at places between the cloud's lights, clear of surfaces. Its direct "
+             "light is not baked but found exactly, but for the steps of soft shadows"]
+    if highlight_errors:
+        found.append("Highlights under lamps: what they show of surfaces that the lamp shines on; the lamp's own "
+                     "highlight is measured apart from the total")
     return found
 
 

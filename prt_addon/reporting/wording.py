@@ -54,6 +54,18 @@ HIGHLIGHT_ERRORS = {
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
 }
 
+# The same for highlights under lamps.
+LOCAL_HIGHLIGHT_ERRORS = {
+    "total": ("All together", "what highlights show of the surfaces that a lamp shines on, against a full simulation "
+              "with the materials' own reflection", ""),
+    "baked": ("As baked", "a limited number of rays, the cloud's lights around the lamp, and the smooth functions of "
+              "the view", "more gather_directions, cloud_lights or glossy_rows"),
+    "bounces": ("Reflections in reflections", "in what highlights show, further reflections are spread evenly", ""),
+    "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
+    "direct": ("The lamp itself", "its own highlight, which no bake holds, is shown with the same smooth functions of "
+               "the view; not part of all together", "more glossy_rows"),
+}
+
 # Upper end of each zone on the error plot and its name; a relative RMS of 1 % is about 2.5 of 255 grey levels at most.
 ZONES = ((0.01, "hard to see"), (0.05, "slight"), (1.0, "visible"))
 
@@ -71,6 +83,8 @@ GLOSSARY = (
      "weights for the cluster's vectors, which takes much less memory than storing everything for every point."),
     ("Overdraw", "how often the mesh's triangles would be drawn if each cluster were drawn on its own; 1 is best."),
     ("Supercluster", "several clusters that an old graphics card could hold at once and draw as one."),
+    ("Light cloud", "lights spread evenly over the space where lamps will move; the light that each of them sends"
+     " around by bounces is baked, and a lamp takes its own from those nearest to it."),
     ("Highlight", "the light that a surface reflects like a blurred mirror: it changes with the direction of view."),
 )
 
