@@ -33,7 +33,7 @@ from prt_addon.lighting.light_cloud import box_matrix
 from prt_addon.lighting.light_visibility import surroundings
 from prt_addon.lighting.local_lights import LocalLight
 from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
-from prt_addon.relighting.lamp_light import LampLight
+from prt_addon.relighting.lamp_light import LampLight, SurfaceLamps, lamps_in
 from prt_addon.relighting.scene_light import joined_light
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.storage.container import BakedTransfer
@@ -95,7 +95,7 @@ def held_back(tracer: Tracer, box: NDArray[np.float64], count: int, clearance: f
     return places[~around.inside & (around.clearance > clearance)][:count]
 
 
-def ours(kept: Kept, lamp: LampLight, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+def ours(kept: Kept, lamp: LampLight | SurfaceLamps, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """Indirect radiance (v, 3), unit albedo: solved at the very position, by the cloud, and by the compressed cloud."""
     exact = np.zeros((len(kept.baked.cluster), 3))
     rows = np.full(len(kept.scene.points), -1)
@@ -127,8 +127,9 @@ def run(name: str, arguments: argparse.Namespace) -> list:
     overrides = {"lighting": "local", "cloud_lights": str(LIGHTS[name]), "cloud_emission": "1"}
     settings = make_settings(arguments.preset, overrides | dict(s.split("=", 1) for s in arguments.set))
     kept = baked(thing, box, settings)
-    lamp = LampLight(kept.baked.cloud, kept.solver.tracer)
-    spacing = kept.report["local"]["spacing"]
+    lamp = lamps_in(kept.baked.cloud, kept.solver.tracer)
+    volume = np.prod(box[1] - box[0])
+    spacing = (volume / int(settings.cloud_lights)) ** (1.0 / 3.0)
     places = held_back(kept.solver.tracer, box, arguments.positions, arguments.clearance * spacing)
     data = bpy.data.lights.new("Lamp", "POINT")
     data.energy, data.shadow_soft_size = POWER, 0.0
@@ -148,7 +149,9 @@ def run(name: str, arguments: argparse.Namespace) -> list:
         sums += np.stack([found, np.ones(4)], axis=1)
     errors = 100.0 * np.sqrt(np.maximum(sums[:, 0], 0.0) / sums[:, 1])
     local, clusters = kept.report["local"], kept.report["clusters"]
-    return [name, len(thing.data.polygons) * 2, local["zones"], local["lights"], float(np.mean(local["merged"])),
+    lights = [1, local["patches"], local["columns"]] if settings.lamp_basis == "surfaces" else [
+        local["zones"], local["lights"], float(np.mean(local["merged"]))]
+    return [name, settings.lamp_basis, len(thing.data.polygons) * 2, *lights,
             clusters["count"], clusters["vectors_mean"], kept.seconds, *errors, PAPER[name]]
 
 
@@ -166,7 +169,8 @@ def main() -> None:
     for name in arguments.scenes.split(","):
         rows.append(run(name, arguments))
         print(rows[-1], flush=True)
-    print_table(["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "vectors, mean", "bake s",
+    print_table(["scene", "columns of", "triangles", "zones", "lights / patches", "merged / columns",
+                 "clusters", "vectors, mean", "bake s",
                  "solver %", "cloud %", "compression %", "all %", "paper: triangles, zones, lights, clusters, fps"],
                 rows)
 

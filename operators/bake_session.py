@@ -198,7 +198,7 @@ def baked_message(result: BakeResult, seconds: float) -> str:
         errors = {name: entry["relative_rms"] for name, entry in (report.get(key) or {}).items()}
         if errors.get("basis", 0.0) > 0.5 * errors.get("total", 0.0):
             if key == "local_errors" or report["settings"]["lighting"] == "local":
-                return f"{text}, mostly because the light cloud has few lights"
+                return f"{text}, mostly because lamps are put together from few columns"
             subject = "" if part == "diffuse" else ", in highlights"
             return f"{text}, mostly because the light is sharper than the order can show{subject}"
     return text

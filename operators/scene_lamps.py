@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.visibility import render_visible_objects
-from ..prt_addon.lighting.light_cloud import LightCloud
+from ..prt_addon.lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.lamp_light import (
     AT_ONCE,
@@ -22,7 +22,9 @@ from ..prt_addon.relighting.lamp_light import (
     CloudLight,
     DirectLight,
     LampLight,
+    SurfaceLamps,
     lamp_shape,
+    lamps_in,
 )
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
@@ -40,7 +42,7 @@ class SceneLamps:
     """Lamps on baked objects. Everything that depends on geometry is kept until `forget_geometry`."""
 
     _tracer: Tracer | None = None
-    _clouds: dict[str, LampLight] = field(default_factory=dict)
+    _clouds: dict[str, LampLight | SurfaceLamps] = field(default_factory=dict)
     _lit: dict[str, CloudLight] = field(default_factory=dict)
     _direct: dict[str, DirectLight] = field(default_factory=dict)
 
@@ -78,7 +80,7 @@ class SceneLamps:
             if key in self._lit:
                 continue
             if key not in self._clouds:
-                self._clouds[key] = LampLight(transfer.cloud, self._tracer)
+                self._clouds[key] = lamps_in(transfer.cloud, self._tracer)
             self._lit[key] = self._clouds[key].step(lamps, seconds)
         for found in self._lit.values():
             warnings += [OUTSIDE.format(name) for name in found.outside] + [UNLIT.format(name) for name in found.unlit]
@@ -126,12 +128,17 @@ def moved_lamps(lamps: Sequence[LocalLight], before: Sequence[LocalLight]) -> se
 
 
 def cloud_key(baked: BakedTransfer) -> str:
-    """The same for bakes with the same light cloud."""
+    """The same for bakes with the same light cloud or lit surfaces."""
+    if isinstance(baked.cloud, LitSurfaces):
+        return digest_arrays(baked.cloud.corners, baked.cloud.patch, baked.cloud.axes)
     return digest_arrays(baked.cloud.positions, baked.cloud.zone_starts, baked.cloud.dense)
 
 
-def cloud_lines(cloud: LightCloud) -> str:
-    """What a light cloud is, in short lines for the panel."""
+def cloud_lines(cloud: LocalBasis) -> str:
+    """What a light cloud is, or lit surfaces are, in short lines for the panel."""
+    if isinstance(cloud, LitSurfaces):
+        return (f"{plural(cloud.axes.shape[1], 'patch', 'patches')} of lit surfaces\n"
+                f"{plural(len(cloud.corners), 'triangle', 'triangles')}\n{plural(cloud.columns, 'column', 'columns')}")
     kept = np.diff(cloud.zone_starts)
     merged = f"{kept.min()}" if kept.min() == kept.max() else f"{kept.min()} to {kept.max()}"
     zones = "1 zone" if len(kept) == 1 else f"{len(kept)} zones"

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lighting.light_cloud import LightCloud
-from ..lighting.light_interpolation import CloudInterpolator
 from ..lighting.light_visibility import surroundings
+from ..lighting.lit_surfaces import LocalBasis
 from ..linear_algebra import batched_multiply
+from ..relighting.lamp_light import unit_weights
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.path_reference import PointLights, reference_radiance
@@ -27,7 +27,7 @@ from .error_budget import by_object, summary
 
 # Places of a lamp that the budget looks at, and how near to a surface they may be, in spacings of the cloud: nearer,
 # all light comes from one small bright spot, which no cloud and few rays can follow.
-PLACES, CLEARANCE = 6, 0.5
+PLACES, CLEARANCE = 12, 0.5
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,17 @@ class Probes:
     responses: NDArray[np.float32]
 
 
-def probe_positions(tracer: Tracer, cloud: LightCloud, seed: int) -> NDArray[np.float64]:
-    """Random places between the lights of the dense cloud, clear of surfaces, at most PLACES."""
+def probe_positions(tracer: Tracer, dense: NDArray[np.float64], spacing: float, seed: int) -> NDArray[np.float64]:
+    """Random places between places (n, 3) that lie so many metres apart, clear of surfaces, at most PLACES."""
     generator = np.random.Generator(np.random.PCG64([seed, 79]))
-    dense = cloud.dense[generator.integers(0, len(cloud.dense), 32 * PLACES)]
-    places = dense + cloud.spacing * generator.uniform(-0.5, 0.5, dense.shape)
+    dense = dense[generator.integers(0, len(dense), 32 * PLACES)]
+    places = dense + spacing * generator.uniform(-0.5, 0.5, dense.shape)
     around = surroundings(tracer, places)
-    return places[~around.inside & (around.clearance > CLEARANCE * cloud.spacing)][:PLACES]
+    return places[~around.inside & (around.clearance > CLEARANCE * spacing)][:PLACES]
 
 
 def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], keys: NDArray[np.int64],
-                 cloud: LightCloud, zone: NDArray[np.int32], probes: Probes, transfer: NDArray[np.float64],
+                 cloud: LocalBasis, zone: NDArray[np.int32], probes: Probes, transfer: NDArray[np.float64],
                  compressed: NDArray[np.float64], bounces: int, paths: int, seed: int,
                  objects: NDArray[np.int64] | None = None, names: tuple[str, ...] = (),
                  ) -> Generator[float, None, dict[str, Any]]:
@@ -70,7 +70,7 @@ def local_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
     rays = tracer.rays - before
     shape = truth.shape[1:]  # (k, places, 3)
     solved = np.broadcast_to(probes.responses[keys[place]].astype(np.float64), shape)
-    weights = CloudInterpolator(cloud, tracer).weights(probes.positions).weights  # (places, zones, lights)
+    weights = unit_weights(cloud, tracer, probes.positions)  # (places, zones, lights)
     own = weights[:, zone[place]].transpose(1, 0, 2)  # (k, places, lights)
     step = cloud.emission_order ** 2
     interpolated, drawn = (np.broadcast_to(batched_multiply(own, np.ascontiguousarray(

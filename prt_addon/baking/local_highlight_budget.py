@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from ..basis import hemisphere
 from ..basis.spherical_harmonics import evaluate, order_of
-from ..lighting.light_cloud import LightCloud
-from ..lighting.light_interpolation import CloudInterpolator
+from ..lighting.lit_surfaces import LocalBasis
 from ..linear_algebra import batched_multiply, multiply
+from ..relighting.lamp_light import unit_weights
 from ..transport.glossy import surface_frames
 from ..transport.path_reference import PATHS_AT_ONCE, PointLights
 from ..transport.receiver_set import ReceiverSet
@@ -37,7 +37,7 @@ from .highlight_sampling import cosine_directions, lattice, to_local, to_world
 Array = NDArray[np.float64]
 
 
-def local_highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, cloud: LightCloud, zone: NDArray[np.int32],
+def local_highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, cloud: LocalBasis, zone: NDArray[np.int32],
                            positions: Array, bounces: int, paths: int, seed: int,
                            ) -> Generator[float, None, dict[str, Any]]:
     """Yield progress, return an entry (see `error_budget.summary`) of each difference above.
@@ -55,7 +55,7 @@ def local_highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, clou
     before = tracer.rays
     even, full = yield from _truth(surfaces, receivers, frames, views, positions, bounces, paths, seed)
     rays = tracer.rays - before
-    weights = CloudInterpolator(cloud, tracer).weights(positions).weights  # (places, zones, lights)
+    weights = unit_weights(cloud, tracer, positions)  # (places, zones, lights)
     own = weights[:, zone].transpose(1, 2, 0)  # (k, lights, places)
     baked, drawn = (_seen(shown, values[:, :, ::cloud.emission_order ** 2], own)
                     for values in (sample.rows, sample.compressed))

@@ -31,8 +31,11 @@ def memory_remedy(plan: Plan, settings: BakeSettings) -> str:
     shiny = any(part.kernel is not None for part in plan.surfaces.parts)
     ways = []
     if settings.local_light:
-        ways += ["fewer lights (cloud_lights)", "more merging (merge_response)"]
-        if settings.cloud_emission > 1:
+        if settings.lamp_basis == "surfaces":
+            ways += ["fewer surface_columns and surface_patches", "fewer lights to learn from (cloud_lights)"]
+        else:
+            ways += ["fewer lights (cloud_lights)", "more merging (merge_response)"]
+        if settings.lamp_basis == "cloud" and settings.cloud_emission > 1:
             ways.append("cloud_emission=1, if spots may bounce like points")
     if shiny:
         ways.append("fewer functions of highlights (glossy_rows)")

@@ -15,6 +15,7 @@ from ..transport.interreflection import SLOW_RATIO
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .settings import BakeSettings
+from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
 # Orders of magnitude measured on two cores (benchmarks/tracing.py); used for the forecast and the progress bar only,
@@ -100,8 +101,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
         values += rows
     wide = 0
     if settings.local_light:
-        local = receivers * settings.cloud_lights * max(settings.cloud_emission, 1) ** 2
-        rays["local"] = receivers * settings.cloud_lights if needs.bounces else 0
+        local = receivers * _local_solutions(settings)
+        rays["local"] = _local_rays(scene, settings, receivers) if needs.bounces else 0
         seconds["local"] = 0.2 + rays["local"] / SHADOW_RAYS_PER_SECOND + local * SECONDS_PER_LOCAL_VALUE
         wide = receivers * _local_columns(settings) * needs.channels
         if glossy and needs.bounces:  # solved once more, and seen by each of them
@@ -121,10 +122,27 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     return Plan(needs, surfaces, receivers, seconds, rays, peak, least, stored, disk)
 
 
+def _local_solutions(settings: BakeSettings) -> int:
+    """Fields of local light that the operator carries at most."""
+    if settings.lamp_basis == "surfaces":
+        return settings.surface_patches
+    return settings.cloud_lights * max(1, settings.cloud_emission) ** 2
+
+
+def _local_rays(scene: SceneMesh, settings: BakeSettings, receivers: int) -> int:
+    """Shadow rays to the lights of a cloud, or to the lamps that lit surfaces are learnt from."""
+    if settings.lamp_basis == "surfaces":
+        lamps = 2 * settings.cloud_lights * (1.0 + NEAR_SURFACES + OUTSIDE)  # points and spots
+        return int(lamps * min(MOST_ELEMENTS, len(scene.triangles)))
+    return receivers * settings.cloud_lights
+
+
 def _local_columns(settings: BakeSettings, share: float = TYPICAL_MERGED_SHARE) -> int:
     """Columns of local lights, if a share of them is left after merging; all functions of a spot's emission count."""
     if not settings.local_light:
         return 0
+    if settings.lamp_basis == "surfaces":
+        return settings.surface_columns
     kept = 1.0 if settings.merge_response == 0.0 or settings.merge_distance == 0.0 else share
     return math.ceil(kept * settings.cloud_lights) * max(1, settings.cloud_emission) ** 2
 
@@ -194,7 +212,7 @@ def _local_memory(settings: BakeSettings, needs: Needs, receivers: int, glossy: 
     if not needs.bounces:
         return _LocalMemory(4 * receivers)
     kept = 4 * receivers * columns * channels + 4 * glossy * functions * columns * channels
-    responses = 4 * receivers * settings.cloud_lights * max(1, settings.cloud_emission) ** 2 * channels
+    responses = 4 * receivers * _local_solutions(settings) * channels
     in_zone = min(1.0, (settings.zone_receivers or receivers) / max(1, receivers))
     at_once = min(COLUMNS, columns)
     solving = 4 * receivers * at_once * (channels + COPIES_OF_SOLVED)
@@ -203,6 +221,9 @@ def _local_memory(settings: BakeSettings, needs: Needs, receivers: int, glossy: 
         threads = settings.threads or os.cpu_count() or 1
         solving += 4 * (receivers + in_zone * glossy * functions) * at_once * channels \
             + 4 * COPIES_OF_BLOCK * threads * seen
+    if settings.lamp_basis == "surfaces":  # the lamps' light at all receivers, and once more of equal weight
+        learnt = 8 * receivers * channels * 2 * settings.cloud_lights * (1.0 + NEAR_SURFACES + OUTSIDE)
+        return _LocalMemory(kept, responses, learnt, solving + 0.5 * learnt)
     return _LocalMemory(kept, responses, 2 * responses * in_zone, solving)
 
 

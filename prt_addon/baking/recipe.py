@@ -49,9 +49,10 @@ from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
+from .lit_highlights import LitHighlights
 from .local_budget import local_budget
 from .local_highlight_budget import local_highlight_budget
-from .local_lights import LitHighlights, LocalTransfer, local_transfer, packed_local, unpacked_local
+from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
 from .memory import memory_warning
 from .plan import Plan, make_plan, most_clusters
 from .results import (

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from ..lighting.light_cloud import LightCloud
 from ..lighting.light_fading import FADE_SECONDS, FadingWeights
 from ..lighting.light_interpolation import NEAREST, CloudInterpolator
+from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..lighting.local_lights import LocalLight
 from ..scene.receivers import morton_order
 from ..tracing.tracer import Tracer
 from .direct_light import LitReceivers, direct_local_light
 from .exit_radiance import Baked
 from .lamp_highlights import LampHighlights, LampSurfaces
+from .surface_light import SurfaceLight
 
 # Points of a lamp with a surface, at most: its indirect light hardly tells more apart.
 MOST_POINTS = 16
@@ -88,6 +90,44 @@ class LampLight:
             return 1
         across = 2.0 * lamp.extent / max(self.cloud.spacing, 1e-30)
         return int(min(MOST_POINTS, max(1, math.ceil(min(across, MOST_POINTS) ** 2))))
+
+
+class SurfaceLamps:
+    """Lamps in columns of lit surfaces: right wherever they are, and at once.
+
+    tracer: of everything that casts shadows.
+    """
+
+    def __init__(self, surfaces: LitSurfaces, tracer: Tracer) -> None:
+        self._light = SurfaceLight(surfaces, tracer)
+
+    def step(self, lamps: Sequence[LocalLight], seconds: float = AT_ONCE) -> CloudLight:
+        """Their light; nothing of it depends on what was before."""
+        values = self._light.columns(lamps, [lamp_shape(lamp) for lamp in lamps])
+        limit = np.finfo(np.float32).max  # 1e300 W are the largest number, not infinity, which spreads NaN
+        return CloudLight(np.clip(values, -limit, limit).astype(np.float32)[None], (), (), True)
+
+
+def lamps_in(basis: LocalBasis, tracer: Tracer) -> LampLight | SurfaceLamps:
+    """What puts lamps together from the columns of a bake."""
+    return SurfaceLamps(basis, tracer) if isinstance(basis, LitSurfaces) else LampLight(basis, tracer)
+
+
+def unit_lamp(position: NDArray[np.float64], name: str = "") -> LocalLight:
+    """A point of 1 W/sr."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    return LocalLight(name, "point", matrix, np.full(3, 4.0 * math.pi))
+
+
+def unit_weights(basis: LocalBasis, tracer: Tracer, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights (places, zones, n) of a point of 1 W/sr at each place (places, 3): of a cloud's lights, each of whose
+    first columns is isotropic, or of columns of lit surfaces."""
+    if not isinstance(basis, LitSurfaces):
+        return CloudInterpolator(basis, tracer).weights(positions).weights
+    light = SurfaceLight(basis, tracer)
+    found = [light.columns([unit_lamp(place)], [number])[:, 0] for number, place in enumerate(positions)]
+    return np.array(found).reshape(len(positions), 1, basis.columns)
 
 
 def _named(names: Sequence[str], chosen: NDArray[np.bool_]) -> tuple[str, ...]:

@@ -185,6 +185,8 @@ def _cloud(report: Report) -> str:
     local = report.get("local")
     if not local:
         return ""
+    if local.get("basis") == "surfaces":
+        return _lit_surfaces(local)
     merged, zones = local["merged"], local["zones"]
     each = local["columns"] / max(1, max(merged))
     intro = ('<p class="why">Lamps that move are put together from the lights of a cloud around them. The points of '
@@ -198,6 +200,19 @@ def _cloud(report: Report) -> str:
             ("Columns of a point's matrix", f"{count(local['columns'])}, {number(each)} for each light")]
     table = _table((("Light cloud", False), ("", False)), [[escape(name), escape(text)] for name, text in rows])
     return _section("Lights that stand for lamps", intro, table)
+
+
+def _lit_surfaces(local: dict[str, Any]) -> str:
+    """The surfaces that lamps shine on."""
+    intro = ('<p class="why">The light that lamps give to patches of surface is found by shadow rays when relighting,'
+             " whatever the lamp and wherever it is; what the patches send on is baked. Zones and merging, which a cloud "
+             "of lights needs, are left out: a column means the same at every point.</p>")
+    rows = [("Patches of surface", f"{count(local['patches'])}, by {count(local['triangles'])} triangles"),
+            ("Columns of a point's matrix", count(local["columns"])),
+            ("Learnt from", f"{count(local['lamps'])} lamps in the open, near to surfaces and outside"),
+            ("Of their light left out", f"{100.0 * float(local['left']):.2g} %")]
+    table = _table((("Lit surfaces", False), ("", False)), [[escape(name), escape(text)] for name, text in rows])
+    return _section("Surfaces that lamps shine on", intro, table)
 
 
 def _compression(report: Report) -> str:

@@ -30,12 +30,13 @@ ERRORS = {
 
 # The same for the bounced light of lamps.
 LOCAL_ERRORS = {
-    "total": ("All together", "the light of a lamp between the cloud's lights, after at least one bounce, against a "
+    "total": ("All together", "the light of a lamp in the open, after at least one bounce, against a "
               "full simulation", ""),
     "sampling": ("Ray sampling", "a limited number of rays, and the mesh's vertices, carry light from surface to "
                  "surface", "more gather_directions, or a smaller spacing"),
-    "basis": ("Light cloud", "a lamp is put together from the lights of the cloud around it", "more cloud_lights, a "
-              "lower merge_response, or a smaller region"),
+    "basis": ("Columns of lamps", "the light that a lamp gives to surfaces is stored by patches of them and their "
+              "leading ways to differ, or put together from a cloud of lights", "more surface_columns and "
+              "surface_patches; with a cloud, more cloud_lights or a lower merge_response"),
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
 }
 
@@ -58,8 +59,8 @@ HIGHLIGHT_ERRORS = {
 LOCAL_HIGHLIGHT_ERRORS = {
     "total": ("All together", "what highlights show of the surfaces that a lamp shines on, against a full simulation "
               "with the materials' own reflection", ""),
-    "baked": ("As baked", "a limited number of rays, the cloud's lights around the lamp, and the smooth functions of "
-              "the view", "more gather_directions, cloud_lights or glossy_rows"),
+    "baked": ("As baked", "a limited number of rays, the columns that lamps are put together from, and the smooth "
+              "functions of the view", "more gather_directions, surface_columns (cloud_lights) or glossy_rows"),
     "bounces": ("Reflections in reflections", "in what highlights show, further reflections are spread evenly", ""),
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
     "direct": ("The lamp itself", "its own highlight, which no bake holds, is shown with the same smooth functions of "
