@@ -43,6 +43,9 @@ NEAREST, FARTHEST, OUTSIDE_FROM, OUTSIDE_TO = 0.005, 0.1, 0.4, 2.5
 NARROWEST, WIDEST, BLEND = 30.0, 120.0, 0.3
 # Columns whose part in what lamps differ is below this share of the first one's are not kept.
 LEAST = 1e-4
+# Patches are parted so many times where walls cross them; rays between members run above the surface by this share of
+# their distance.
+PARTINGS, ABOVE = 4, 0.2
 # Patches carried through the operator at once, and how the progress is shared: learning, patches, highlights.
 BLOCK, LEARNT, CARRIED = 256, 0.25, 0.85
 
@@ -172,8 +175,11 @@ def _surfaces(tracer: Tracer, scene: SceneMesh, gathered: Gather, most: int, see
     edges = corners[:, 1:] - corners[:, :1]
     area = 0.5 * np.sqrt(np.sum(np.cross(edges[:, 0], edges[:, 1]) ** 2, axis=1))
     own = np.bincount(scene.triangles.ravel(), np.repeat(area / 3.0, 3), count)[key % count]
-    patch = make_patches(scene.points[key % count], gathered.receivers.normals.astype(np.float64), own,
-                         tracer.diagonal, most)
+    receivers = gathered.receivers
+    # Where rays start is pulled into the receiver's own faces: two floors that meet under a wall are told apart.
+    places, normals = receivers.origins.astype(np.float64), receivers.normals.astype(np.float64)
+    patch = make_patches(places, normals, own, 1.0, most)
+    patch = _parted(tracer, places, normals, patch)
     sides, patches = [], []
     for side in (0, 1):
         rows = row[scene.triangles + side * count]
@@ -183,6 +189,39 @@ def _surfaces(tracer: Tracer, scene: SceneMesh, gathered: Gather, most: int, see
     elements = lit_elements(np.concatenate(sides), np.concatenate(patches).astype(np.int32), MOST_ELEMENTS, seed)
     total = int(patch.max(initial=0)) + 1
     return patch, LitSurfaces(*elements, np.zeros((1, total), np.float32))
+
+
+def _parted(tracer: Tracer, places: NDArray[np.float64], normals: NDArray[np.float64], patch: NDArray[np.int32],
+            ) -> NDArray[np.int32]:
+    """Patches (r,) whose members see their middle one; the others of a patch become patches of their own, again and
+    again. A patch on both sides of a wall would carry light through it.
+
+    places: (r, 3) in tracing space. Rays run above the surface, so that a bulge does not part a patch.
+    """
+    patch = patch.copy()
+    unsure = np.flatnonzero(patch >= 0)
+    for _ in range(PARTINGS):
+        if not len(unsure):
+            break
+        total = int(patch.max()) + 1
+        members = np.bincount(patch[unsure], minlength=total)
+        mean = np.stack([np.bincount(patch[unsure], places[unsure, k], total) for k in range(3)], axis=1)
+        mean /= np.maximum(members, 1)[:, None]
+        away = np.sum((places[unsure] - mean[patch[unsure]]) ** 2, axis=1)
+        order = np.lexsort((unsure, away, patch[unsure]))
+        first = np.unique(patch[unsure][order], return_index=True)[1]
+        middle = np.full(total, -1)
+        middle[patch[unsure][order][first]] = unsure[order][first]
+        to = middle[patch[unsure]]
+        height = ABOVE * np.sqrt(np.sum((places[unsure] - places[to]) ** 2, axis=1))[:, None]
+        start = places[unsure] + height * normals[unsure]
+        towards = places[to] + height * normals[to] - start
+        hidden = tracer.occluded(start.astype(np.float32), towards.astype(np.float32),
+                                 np.ones(len(start), np.float32)) & (to != unsure)
+        unsure = unsure[hidden]
+        number = np.unique(patch[unsure], return_inverse=True)[1]
+        patch[unsure] = total + number
+    return patch
 
 
 def _leading(learnt: Single, most: int) -> tuple[Single, Single, Single, float]:
