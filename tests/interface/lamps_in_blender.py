@@ -233,10 +233,11 @@ def undo_and_redo() -> Step:
 
 
 def preview() -> Step:
-    """The viewport shows what the CPU says, in both shadings that a lamp is dragged in."""
+    """The viewport shows what the CPU says, in both shadings that a lamp is dragged in. Solid then stays: it is redrawn
+    in a tenth of the time here."""
     with override():
         assert bpy.ops.prt.toggle_preview() == {"FINISHED"}
-    for shading in ("SOLID", "MATERIAL"):
+    for shading in ("MATERIAL", "SOLID"):
         area().spaces.active.shading.type = shading
         yield from check_picture(f"l04_{shading.lower()}")
     assert not session().preview_message, session().preview_message
