@@ -17,6 +17,7 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
+import gpu
 import numpy as np
 from mathutils import Vector
 
@@ -51,7 +52,7 @@ LAMPS_STAGE = "Local lights"
 MEAN_LEVELS, MOST_LEVELS = 0.6, 4.0
 OTHERS: set[Path] = set()
 RIM = 0.35  # cosine
-PATIENCE = 20.0  # seconds
+PATIENCE = 40.0  # seconds
 FACES = ((-0.026, 0.133, 0.3), (0.367, -0.026, 0.3))  # of the box, towards the red wall and away from it
 
 
@@ -183,6 +184,7 @@ def left_over() -> list[str]:
 
 def open_room() -> Step:
     """The panel shows the settings of local lights."""
+    print(f"drawn by {gpu.platform.backend_type_get()}", flush=True)
     with override():
         bpy.ops.wm.open_mainfile(filepath=str(SCENE), load_ui=False)
     yield 1.0
