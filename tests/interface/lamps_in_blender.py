@@ -206,17 +206,8 @@ def open_room() -> Step:
 def bake_lamps() -> Step:
     """A bake for lamps runs beside Blender and tells of its light cloud."""
     invoke("merge_response=0.02")
-    stages = set()
-    while session().running and not (LAMPS_STAGE in stages and session().stage != LAMPS_STAGE):
-        if session().stage == LAMPS_STAGE and LAMPS_STAGE not in stages:
-            yield 0.3  # until it is drawn
-            shoot("l02_baking")
-            stages.add(LAMPS_STAGE)
-        stages.add(session().stage)
-        yield 0.02
-    yield from wait_for_bake()
+    yield from wait_for_bake("l02_baking")
     assert not session().failed, session().message
-    assert LAMPS_STAGE in stages, stages
     yield from until(lambda: baked_names() == OBJECTS, f"the panel lists {baked_names()}")
     assert not children() and not jobs()
     yield DRAWN
