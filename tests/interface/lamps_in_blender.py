@@ -189,7 +189,7 @@ def open_room() -> Step:
         bpy.ops.wm.open_mainfile(filepath=str(SCENE), load_ui=False)
     yield 1.0
     space, settings = area().spaces.active, bpy.context.scene.prt
-    space.show_region_ui, space.show_region_toolbar, space.shading.type = True, False, "MATERIAL"
+    space.show_region_ui, space.show_region_toolbar, space.shading.type = True, False, "SOLID"
     space.overlay.show_overlays, space.show_gizmo = False, False
     space.region_3d.view_perspective = "CAMERA"
     settings.preset, settings.lighting = "draft", "local"
