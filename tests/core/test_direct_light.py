@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -379,6 +381,14 @@ def test_fewer_samples_change_penumbrae_only_and_by_their_steps():
     assert np.mean(difference[~penumbra] > 1e-6) < 0.02  # at its rim, where a quarter of the lamp is all or nothing
     assert difference.max() <= 0.5
     assert 0.01 < np.sqrt(np.mean(difference[penumbra] ** 2)) < 0.15
+
+    def largest_step(samples):
+        """From one place of the lamp to the next one, 2 cm on: what could be seen as flicker."""
+        shares = [direct.of([replace(ball, matrix=lamp("point", (0.3 + 0.02 * k, 0.0, 2.0)).matrix)], [samples])
+                  / unshadowed for k in range(9)]
+        return max(float(np.sqrt(np.mean((b - a) ** 2))) for a, b in itertools.pairwise(shares))
+
+    assert largest_step(4) < 2.0 * largest_step(16), largest_step(4) / largest_step(16)
 
 
 def test_a_cutoff_costs_no_more_than_itself():
