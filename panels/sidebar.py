@@ -100,6 +100,10 @@ class PRT_PT_local_lights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
+        column.prop(settings, "lamp_basis")
+        by_cloud = settings.lamp_basis == "cloud"
+        if not by_cloud:
+            column.prop(settings, "surface_columns")
         column.prop(settings, "cloud_region")
         several = column.column()
         several.active = settings.cloud_region is None
@@ -108,8 +112,9 @@ class PRT_PT_local_lights(_Expert, bpy.types.Panel):
         lights.active = settings.cloud_spacing == 0.0
         lights.prop(settings, "cloud_lights")
         column.prop(settings, "cloud_spacing")
-        column.prop(settings, "merge_response")
-        column.prop(settings, "zone_receivers")
+        if by_cloud:
+            column.prop(settings, "merge_response")
+            column.prop(settings, "zone_receivers")
 
 
 class PRT_PT_preview(_Sidebar, bpy.types.Panel):

@@ -132,7 +132,7 @@ def _local_solutions(settings: BakeSettings) -> int:
 def _local_rays(scene: SceneMesh, settings: BakeSettings, receivers: int) -> int:
     """Shadow rays to the lights of a cloud, or to the lamps that lit surfaces are learnt from."""
     if settings.lamp_basis == "surfaces":
-        lamps = 2 * settings.cloud_lights * (1.0 + NEAR_SURFACES + OUTSIDE)  # points and spots
+        lamps = settings.cloud_lights * (1.0 + NEAR_SURFACES + OUTSIDE)
         return int(lamps * min(MOST_ELEMENTS, len(scene.triangles)))
     return receivers * settings.cloud_lights
 

@@ -88,7 +88,7 @@ class BakeSettings:
     lighting: str = "environment"
     lamp_basis: str = "surfaces"
     surface_patches: int = 2048
-    surface_columns: int = 256
+    surface_columns: int = 384
     cloud_region: str = ""
     cloud_lights: int = 216
     cloud_spacing: float = 0.0
@@ -123,7 +123,7 @@ PRESETS: dict[str, BakeSettings] = {
                           error_receivers=32, error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
     "standard": BakeSettings(),
     "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
-                         surface_patches=4096, surface_columns=384, cloud_lights=512, merge_response=0.02,
+                         surface_patches=4096, surface_columns=512, cloud_lights=512, merge_response=0.02,
                          encoder="adaptive", compression_error=5e-4,
                          spacing=1.0 / 128.0, error_receivers=128, error_paths=16384, glossy_rows=24,
                          glossy_albedo=0.03),

@@ -75,15 +75,16 @@ def surface_columns(tracer: Tracer, scene: SceneMesh, solver: LightSolver, rows:
     count = surfaces.axes.shape[1]
     lamps = training_lamps(tracer, surfaces, open_places, seed)
     light = SurfaceLight(surfaces, tracer)
-    lit = np.zeros((count, len(lamps)), np.float32)
-    for number, lamp in enumerate(lamps):
-        lit[:, number] = light.patches(lamp)
+    lit = np.zeros((count, 2 * len(lamps)), np.float32)
+    for number, (point, spot) in enumerate(lamps):
+        flux = light.flux(point)
+        lit[:, number], lit[:, len(lamps) + number] = light.mean(flux), light.mean(light.aimed(flux, spot))
         yield LEARNT * (number + 1) / len(lamps)
     channels = solver.albedo.shape[1]
     with tempfile.TemporaryDirectory(dir=folder, prefix="responses-") as place:
         responses = np.lib.format.open_memmap(Path(place) / "patches.npy", "w+", np.float32,
                                               (count, len(rows) * channels))
-        learnt = np.zeros((len(lamps), len(rows) * channels), np.float32)
+        learnt = np.zeros((lit.shape[1], len(rows) * channels), np.float32)
         for start in range(0, count, BLOCK):
             chosen = slice(start, min(start + BLOCK, count))
             fields = (patch[:, None] == np.arange(chosen.start, chosen.stop)).astype(np.float32)
@@ -107,7 +108,7 @@ def surface_columns(tracer: Tracer, scene: SceneMesh, solver: LightSolver, rows:
     patterns = np.where((patch >= 0)[:, None], pattern[patch], np.float32(0.0))
     yield 1.0
     return SurfaceColumns(LitSurfaces(surfaces.corners, surfaces.patch, projection), transfer, patterns, left,
-                          len(lamps))
+                          lit.shape[1])
 
 
 def surface_highlights(solver: LightSolver, columns: SurfaceColumns, highlights: LitHighlights,
@@ -132,8 +133,8 @@ def surface_highlights(solver: LightSolver, columns: SurfaceColumns, highlights:
 
 
 def training_lamps(tracer: Tracer, surfaces: LitSurfaces, open_places: NDArray[np.float64], seed: int,
-                   ) -> list[LocalLight]:
-    """Points and spots of 1 W/sr in the open, near to surfaces and outside, from which columns are learnt."""
+                   ) -> list[tuple[LocalLight, LocalLight]]:
+    """Points of 1 W/sr in the open, near to surfaces and outside, from which columns are learnt, each with a spot."""
     generator = np.random.Generator(np.random.PCG64([seed, 84]))
     corners = surfaces.corners.astype(np.float64)
     upright = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -152,8 +153,7 @@ def training_lamps(tracer: Tracer, surfaces: LitSurfaces, open_places: NDArray[n
     far = tracer.diagonal * np.exp(generator.uniform(np.log(OUTSIDE_FROM), np.log(OUTSIDE_TO), len(direction)))
     middle = corners.reshape(-1, 3).mean(axis=0) if len(corners) else np.zeros(3)
     places = np.concatenate([open_places, near, middle + far[:, None] * direction])
-    lamps = [unit_lamp(place) for place in places]
-    return lamps + [_spot(lamp.position, generator) for lamp in lamps]
+    return [(unit_lamp(place), _spot(place, generator)) for place in places]
 
 
 def _spot(position: NDArray[np.float64], generator: np.random.Generator) -> LocalLight:

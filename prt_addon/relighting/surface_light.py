@@ -42,7 +42,7 @@ class SurfaceLight:
         self._patch = surfaces.patch.ravel()[self._known].astype(np.intp)
         self._patches = surfaces.axes.shape[1]
         shares = np.repeat(self._area / 3.0, 3)[self._known]
-        whole = np.bincount(self._patch, shares, self._patches)
+        whole = np.bincount(self._patch, shares, self._patches).astype(np.float64)
         self._over_area = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0.0)
         self._kept: dict[Hashable, Double] = {}
 
@@ -59,14 +59,25 @@ class SurfaceLight:
     def patches(self, lamp: LocalLight) -> Double:
         """Mean E / pi (patches,) of a lamp of even colour on each patch, so that its flux is right however near it
         is."""
-        tracer = self._tracer
-        value = direct_local_light(tracer, self._receivers, [lamp], SAMPLES)[:, 0].astype(np.float64)
+        return self.mean(self.flux(lamp))
+
+    def flux(self, lamp: LocalLight) -> Double:
+        """Flux over pi (s, 3) of a lamp of even colour to the thirds of the triangles."""
+        value = direct_local_light(self._tracer, self._receivers, [lamp], SAMPLES)[:, 0].astype(np.float64)
         flux = np.repeat((value * self._area / 3.0)[:, None], 3, axis=1)
         reach = NEAR * self._size + lamp.extent
         near = np.flatnonzero(np.sum((self._middle - lamp.position) ** 2, axis=1) < reach * reach)
         if len(near):
             flux[near] = self._near(lamp, near)
+        return flux
+
+    def mean(self, flux: Double) -> Double:
+        """Mean E / pi (patches,) of flux over pi (s, 3)."""
         return np.bincount(self._patch, flux.ravel()[self._known], self._patches) * self._over_area
+
+    def aimed(self, flux: Double, spot: LocalLight) -> Double:
+        """Flux of a point as that of a spot at its place, by the triangles' middles: to learn from, not to show."""
+        return flux * spot.pattern(self._middle - spot.position)[:, None]
 
     def _near(self, lamp: LocalLight, near: NDArray[np.int64]) -> Double:
         """Flux over pi (n, 3) to the corners' thirds of triangles near a lamp, by parts of them."""

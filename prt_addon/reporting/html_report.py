@@ -205,8 +205,8 @@ def _cloud(report: Report) -> str:
 def _lit_surfaces(local: dict[str, Any]) -> str:
     """The surfaces that lamps shine on."""
     intro = ('<p class="why">The light that lamps give to patches of surface is found by shadow rays when relighting,'
-             " whatever the lamp and wherever it is; what the patches send on is baked. Zones and merging, which a cloud "
-             "of lights needs, are left out: a column means the same at every point.</p>")
+             " whatever the lamp and wherever it is; what the patches send on is baked. Zones and merging, which a "
+             "cloud of lights needs, are left out: a column means the same at every point.</p>")
     rows = [("Patches of surface", f"{count(local['patches'])}, by {count(local['triangles'])} triangles"),
             ("Columns of a point's matrix", count(local["columns"])),
             ("Learnt from", f"{count(local['lamps'])} lamps in the open, near to surfaces and outside"),

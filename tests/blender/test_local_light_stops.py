@@ -19,7 +19,7 @@ TOOL = Path(__file__).parents[2] / "tools" / "prt.py"
 # Few rays, many lights: most of the bake is the lamps' stage.
 LONG = ["--preset", "draft", "--lighting", "local", "--set", "cloud_region=Region", "--set", "cloud_lights=200",
         "--set", "merge_response=0", "--set", "cloud_emission=1", "--set", "error_receivers=0", "--set", "spacing=0.02",
-        "--set", "vectors=2", "--set", "clusters=8"]
+        "--set", "vectors=2", "--set", "clusters=8", "--set", "lamp_basis=cloud"]
 
 
 def unfinished(job: Path) -> list[Path]:

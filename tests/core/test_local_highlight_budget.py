@@ -23,7 +23,8 @@ from prt_addon.transport.path_reference import DistantSuns, PointLights
 from tests.core.shapes import plane, sphere
 
 SETTINGS = make_settings("draft", {"spacing": "0", "threads": "1", "directions": "256", "gather_directions": "256",
-                                   "lighting": "local", "cloud_emission": "1", "cloud_lights": "27",
+                                   "lighting": "local", "lamp_basis": "cloud",
+                                   "cloud_emission": "1", "cloud_lights": "27",
                                    "error_receivers": "24", "error_paths": "2048", "vectors": "12"})
 REGIONS = np.array([box_matrix((-1.5, -1.5, 0.2), (1.5, 1.5, 2.2))])
 

@@ -48,7 +48,7 @@ peak = max(stage["peak_bytes"] for stage in exhaust(bake(scene, settings)).repor
 plan = make_plan(scene, transport_settings(settings), None)
 print(json.dumps([before, peak, plan.peak_bytes, plan.least_bytes]))
 """
-LAMPS = ("lighting=local", "cloud_emission=2", "glossy_rows=4", "cloud_lights=48", "vectors=4")
+LAMPS = ("lighting=local", "lamp_basis=cloud", "cloud_emission=2", "glossy_rows=4", "cloud_lights=48", "vectors=4")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory otherwise")
@@ -76,19 +76,24 @@ def test_local_lights_count():
     """As columns in what is stored, as responses on disk, and in memory; merging makes them fewer."""
     scene = still_life("grey")
     distant, local, both, all_kept = (make_plan(scene, make_settings("standard", {**QUICK, **more}), None) for more in (
-        {}, {"lighting": "local"}, {"lighting": "environment,local"},
-        {"lighting": "environment,local", "merge_response": "0"}))
+        {}, {"lighting": "local", "lamp_basis": "cloud"}, {"lighting": "environment,local", "lamp_basis": "cloud"},
+        {"lighting": "environment,local", "lamp_basis": "cloud", "merge_response": "0"}))
     assert distant.stored_bytes < both.stored_bytes < all_kept.stored_bytes and local.stored_bytes < both.stored_bytes
     responses = 4 * both.receivers * 216 * both.needs.channels
     assert both.disk_bytes > distant.disk_bytes + responses and both.peak_bytes > distant.peak_bytes
-    directed = make_plan(scene, make_settings("standard", {**QUICK, "lighting": "local", "cloud_emission": "3"}), None)
+    directed = make_plan(scene, make_settings("standard", {
+        **QUICK, "lighting": "local", "lamp_basis": "cloud", "cloud_emission": "3"}), None)
     assert directed.disk_bytes > 8 * responses
+    surfaces = make_plan(scene, make_settings("standard", {**QUICK, "lighting": "local"}), None)
+    assert surfaces.disk_bytes > distant.disk_bytes + 4 * surfaces.receivers * 2048 * surfaces.needs.channels
+    assert surfaces.stored_bytes > distant.stored_bytes
 
 
 def test_a_bake_that_can_not_fit_is_refused_with_a_remedy(monkeypatch):
     """Much more than there is: refused before the first ray; somewhat more: a warning, in the report, too."""
     scene = still_life("metal", 2)
-    settings = make_settings("draft", {**QUICK, "lighting": "local", "cloud_emission": "2", "cloud_lights": "8"})
+    settings = make_settings("draft", {**QUICK, "lighting": "local", "lamp_basis": "cloud", "cloud_emission": "2",
+                                       "cloud_lights": "8"})
     plan = make_plan(scene, transport_settings(settings), None)
     assert plan.least_bytes < plan.peak_bytes
     monkeypatch.setattr(memory, "available_bytes", lambda: plan.least_bytes - 1)

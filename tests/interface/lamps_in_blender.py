@@ -192,7 +192,7 @@ def open_room() -> Step:
     space.show_region_ui, space.show_region_toolbar, space.shading.type = True, False, "SOLID"
     space.overlay.show_overlays, space.show_gizmo = False, False
     space.region_3d.view_perspective = "CAMERA"
-    settings.preset, settings.lighting = "draft", "local"
+    settings.preset, settings.lighting, settings.lamp_basis = "draft", "local", "cloud"
     OTHERS.update(jobs())
     yield 1.5
     region("UI").active_panel_category = "PRT"

@@ -119,6 +119,7 @@ def check_kill_among_lamps(blender: Blender, scene: Path) -> None:
     output, report = blender.output / "killed.blend", blender.output / "killed.json"
     command = ("--command", "prt", "bake", "--input", str(scene), "--output", str(output), "--report", str(report),
                "--preset", "draft", "--lighting", "local", "--set", "cloud_region=Region", "--set", "cloud_lights=300",
+               "--set", "lamp_basis=cloud",
                "--set", "merge_response=0", "--set", "error_receivers=0", "--set", "spacing=0.02")
     running = blender.start_command(*command)
     for line in running.stderr:
