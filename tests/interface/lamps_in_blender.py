@@ -475,7 +475,31 @@ def both_kinds() -> Step:
     yield from check_picture("l23_both_lamp_moved")
 
 
+def lit_surfaces() -> Step:
+    """A bake by the surfaces that lamps shine on: right in the open, at a wall and out of the room; a spot, too."""
+    settings = bpy.context.scene.prt
+    settings.lighting, settings.lamp_basis = "local", "surfaces"
+    lamp().location = (0.0, 0.0, 1.2)
+    yield 1.0
+    shoot("l30_settings")
+    invoke("surface_patches=512, surface_columns=96, cloud_lights=27")
+    yield from wait_for_bake()
+    assert not session().failed, session().message
+    assert "lit surfaces" in session().cloud, session().cloud
+    yield from check_picture("l31_surfaces")
+    for name, place in (("l32_at_wall", (-0.85, 0.0, 0.5)), ("l33_outside", (1.6, 0.0, 1.4))):
+        lamp().location = place
+        yield from check_picture(name)
+        assert not session().preview_message, session().preview_message
+    lamp().data.type = "SPOT"
+    lamp().location, lamp().rotation_euler = (0.0, 0.0, 1.2), (0.9, 0.0, 0.4)
+    yield from check_picture("l34_spot")
+    lamp().data.type = "POINT"
+    settings.lamp_basis = "cloud"
+
+
 STEPS = (open_room, bake_lamps, undo_and_redo, preview, drag, drag_by_mouse, follow_lamp, play, lamp_outside,
-         both_kinds, colour_attribute, cancel_in_lamps_stage, resume_after_kill, metal_under_lamps)
+         both_kinds, colour_attribute, cancel_in_lamps_stage, resume_after_kill, metal_under_lamps,
+         lit_surfaces)
 
 start(STEPS, "lamps")
