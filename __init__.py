@@ -11,6 +11,8 @@ from .operators.bake import PRT_OT_bake, PRT_OT_cancel
 from .operators.clear import PRT_OT_clear
 from .operators.job_mixin import JobMixin
 from .operators.preview import PRT_OT_toggle_preview
+from .operators.relight import PRT_OT_relight
+from .panels.lamp import PRT_PT_lamp
 from .panels.sidebar import PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_preview, PRT_PT_results
 
 CLASSES = (
@@ -22,11 +24,13 @@ CLASSES = (
     PRT_OT_cancel,
     PRT_OT_clear,
     PRT_OT_toggle_preview,
+    PRT_OT_relight,
     PRT_PT_bake,
     PRT_PT_highlights,
     PRT_PT_local_lights,
     PRT_PT_preview,
     PRT_PT_results,
+    PRT_PT_lamp,
 )
 
 

@@ -99,8 +99,8 @@ def prepared(name: str) -> tuple[Kept, Array]:
     """The operator of a scene: a bake of a few lights, kept."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     thing, box = SCENES[name]()
-    settings = {"lighting": "local", "cloud_lights": "8", "cloud_emission": "1", "error_receivers": "0",
-                "gather_directions": "2048", "clusters": "8"}
+    settings = {"lighting": "local", "lamp_basis": "cloud", "cloud_lights": "8", "cloud_emission": "1",
+                "error_receivers": "0", "gather_directions": "2048", "clusters": "8"}
     inside = box.mean(axis=0) + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
     return baked(thing, box, make_settings("standard", settings), inside=inside), box
 

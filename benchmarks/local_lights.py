@@ -3,7 +3,7 @@
 wheel.
 
     python benchmarks/local_lights.py [--scenes cornell,hole,bunny,maze,dense,densest] [--positions 20]
-                                      [--samples 64] [--docs] [--set NAME=VALUE ...]
+                                      [--samples 64] [--bases cloud,surfaces] [--docs] [--set NAME=VALUE ...]
 
 A lamp moves to held-back random places, half a spacing of the cloud or more from surfaces; indirect light there is
 compared with Cycles' own vertex bake of indirect light (of the glossy bunny: what it sends of it to a camera), as a
@@ -47,7 +47,7 @@ from prt_addon.relighting.exit_radiance import (
     hemisphere_values,
     local_views,
 )
-from prt_addon.relighting.lamp_light import DirectLight, LampLight
+from prt_addon.relighting.lamp_light import DirectLight, LampLight, SurfaceLamps, lamps_in
 from prt_addon.relighting.scene_light import joined_light
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.storage.container import BakedTransfer
@@ -149,7 +149,8 @@ def solved_towards(thing: bpy.types.Object, places: NDArray[np.float64], setting
     """Indirect radiance (v, 3, places) towards views (v, 3), solved at the very places: a cloud of just these lights,
     one in each of as many small boxes, of which nothing merges."""
     corners = np.stack([places - 1e-5, places + 1e-5], axis=1)
-    settings = replace(settings, cloud_lights=len(places), merge_response=0.0, zone_receivers=0, clusters=1, vectors=0)
+    settings = replace(settings, lamp_basis="cloud", cloud_lights=len(places), merge_response=0.0, zone_receivers=0,
+                       clusters=1, vectors=0)
     exact = baked(thing, corners, settings)
     distance, order = cKDTree(exact.baked.cloud.positions).query(places)
     if distance.max() > 1e-3:
@@ -167,7 +168,7 @@ def point_lamp(position: NDArray[np.float64]) -> LocalLight:
     return LocalLight("lamp", "point", matrix, np.full(3, POWER))
 
 
-def ours(kept: Kept, lamp: LampLight, position: NDArray[np.float64], views: NDArray[np.float64] | None,
+def ours(kept: Kept, lamp: LampLight | SurfaceLamps, position: NDArray[np.float64], views: NDArray[np.float64] | None,
          ) -> tuple[NDArray[np.float64], ...]:
     """Indirect radiance (v, 3) by the cloud and by the compressed cloud: for unit albedo, or towards views (v, 3)."""
     baked = kept.baked
@@ -199,7 +200,7 @@ def add_camera(kept: Kept) -> NDArray[np.float64]:
     return place - kept.baked.positions
 
 
-def milliseconds(kept: Kept, lamp: LampLight, places: NDArray[np.float64]) -> list[float]:
+def milliseconds(kept: Kept, lamp: LampLight | SurfaceLamps, places: NDArray[np.float64]) -> list[float]:
     """Of a move of one lamp, and of a frame's light on the processor: the least of some runs, the mean over places."""
     baked, direct = kept.baked, DirectLight(kept.solver.tracer, kept.baked)
 
@@ -216,16 +217,18 @@ def milliseconds(kept: Kept, lamp: LampLight, places: NDArray[np.float64]) -> li
     return [move_ms, move_ms + 1e3 * float(np.mean(drawn) + np.mean(lit))]
 
 
-def run(name: str, arguments: argparse.Namespace) -> list:
-    """One scene's line of the table."""
+def run(name: str, basis: str, arguments: argparse.Namespace) -> list:
+    """A line of the table: one scene, one basis of lamps."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     thing, box = local_scenes.SCENES["cornell" if name in PLACES else name]()
     use_cycles(arguments.samples)
     bpy.context.scene.render.threads = 2
-    overrides = ALL_SCENES | SETTINGS[name] | dict(s.split("=", 1) for s in arguments.set)
-    kept = baked(thing, box, make_settings(arguments.preset, overrides))
-    lamp = LampLight(kept.baked.cloud, kept.solver.tracer)
-    spacing = PLACES.get(name, kept.report["local"]["spacing"])
+    overrides = ALL_SCENES | SETTINGS[name] | {"lamp_basis": basis} | dict(s.split("=", 1) for s in arguments.set)
+    settings = make_settings(arguments.preset, overrides)
+    kept = baked(thing, box, settings)
+    lamp = lamps_in(kept.baked.cloud, kept.solver.tracer)
+    # The cloud's, whatever the basis: the same places for both.
+    spacing = PLACES.get(name, float(np.prod(box[1] - box[0]) / settings.cloud_lights) ** (1.0 / 3.0))
     places = held_back(kept.solver.tracer, box, arguments.positions, arguments.clearance * spacing)
     views, passes, chosen = None, {"INDIRECT"}, kept.visible
     if kept.baked.functions:
@@ -234,7 +237,7 @@ def run(name: str, arguments: argparse.Namespace) -> list:
         chosen = kept.visible[facing[kept.visible]]
     costs = milliseconds(kept, lamp, places)
     if views is not None:
-        towards = solved_towards(thing, places, make_settings(arguments.preset, overrides), views)[chosen]
+        towards = solved_towards(thing, places, settings, views)[chosen]
     data = bpy.data.lights.new("Lamp", "POINT")
     data.energy, data.shadow_soft_size = POWER, 0.0
     source = bpy.data.objects.new("Lamp", data)
@@ -256,8 +259,10 @@ def run(name: str, arguments: argparse.Namespace) -> list:
     print(f"{name}: Cycles took {time.perf_counter() - started:.0f} s; {far.sum()} of {len(far)} places in the open")
     local, clusters = kept.report["local"], kept.report["clusters"]
     triangles = sum(len(polygon.vertices) - 2 for thing in bpy.data.meshes for polygon in thing.polygons)
-    return [name, triangles, local["zones"], local["lights"], float(np.mean(local["merged"])), clusters["count"],
-            clusters["vectors_mean"], f"{kept.seconds:.0f} s", *costs, *errors[:4], open_error, errors[4]]
+    lights = [1, local["patches"], local["columns"]] if basis == "surfaces" else [
+        local["zones"], local["lights"], float(np.mean(local["merged"]))]
+    return [name, basis, triangles, *lights, clusters["count"], clusters["vectors_mean"],
+            f"{kept.seconds:.0f} s", *costs, *errors[:4], open_error, errors[4]]
 
 
 def _percent(squares: NDArray[np.float64]) -> list[float]:
@@ -265,13 +270,15 @@ def _percent(squares: NDArray[np.float64]) -> list[float]:
     return [round(100.0 * float(np.sqrt(max(square, 0.0))), 2) for square in squares]
 
 
-HEADER = ["scene", "triangles", "zones", "lights", "merged, mean", "clusters", "vectors, mean", "bake", "move ms",
-          "frame ms", "solver %", "cloud %", "compression %", "all %", "open %", "Cycles' noise %"]
+HEADER = ["scene", "basis", "triangles", "zones", "lights or patches", "merged or columns", "clusters",
+          "vectors, mean", "bake", "move ms", "frame ms", "solver %", "basis %", "compression %", "all %", "open %",
+          "Cycles' noise %"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", default="cornell,hole,bunny,maze,dense,densest")
+    parser.add_argument("--bases", default="cloud,surfaces")
     parser.add_argument("--positions", type=int, default=20)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--clearance", type=float, default=0.5,
@@ -283,15 +290,16 @@ def main() -> None:
     arguments = parser.parse_args()
     known = json.loads(arguments.rows.read_text()) if arguments.rows and arguments.rows.exists() else {}
     for name in filter(None, arguments.scenes.split(",")):
-        known[name] = run(name, arguments)
-        if arguments.rows:
-            arguments.rows.write_text(json.dumps(known))
+        for basis in arguments.bases.split(","):
+            known[f"{name} {basis}"] = run(name, basis, arguments)
+            if arguments.rows:
+                arguments.rows.write_text(json.dumps(known))
     rows = []
-    for name, row in known.items():
-        rows.append(row)
-        if name in PAPER:
+    for name in SETTINGS:
+        rows += [known[key] for key in known if key.split()[0] == name]
+        if name in PAPER and any(key.split()[0] == name for key in known):
             *sizes, hours, rate = PAPER[name]
-            rows.append(["the paper", *sizes, hours, "", f"{1000 / rate:.0f}", *[""] * 6])
+            rows.append(["", "the paper", *sizes, hours, "", f"{1000 / rate:.0f}", *[""] * 6])
     table = markdown_table(HEADER, rows)
     print(table)
     if arguments.docs:

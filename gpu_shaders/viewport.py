@@ -21,9 +21,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import blf
 import bpy
 import gpu
 import numpy as np
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+from mathutils import Vector
 
 from ..prt_addon.errors import PRTError
 from . import programs
@@ -35,8 +38,16 @@ GetDrawList = Callable[[], Sequence[DrawItem]]
 IsComplete = Callable[[], bool]
 
 
+GetLabels = Callable[[], Sequence[tuple[str, Sequence[float]]]]
+LABEL_SIZE, LABEL_OFFSET = 12, (14, 10)  # in units of the interface's scale
+
+
 def _never_complete() -> bool:
     return False
+
+
+def _no_labels() -> Sequence[tuple[str, Sequence[float]]]:
+    return ()
 
 
 @dataclass
@@ -59,6 +70,7 @@ class _Viewport:
 
     get_draw_list: GetDrawList
     is_complete: IsComplete
+    get_labels: GetLabels = _no_labels
     handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
     framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
@@ -68,19 +80,22 @@ class _Viewport:
 _active: _Viewport | None = None
 
 
-def enable(get_draw_list: GetDrawList, is_complete: IsComplete = _never_complete) -> None:
+def enable(get_draw_list: GetDrawList, is_complete: IsComplete = _never_complete,
+           get_labels: GetLabels = _no_labels) -> None:
     """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the callables change.
 
     get_draw_list runs on every redraw of every region, with bpy.context of that region: it must be cheap, and may
     raise PRTError, which `status()` then shows. is_complete runs after it and says whether the listed objects are the
-    only visible surfaces of the region; then they hide each other by their own depth alone.
+    only visible surfaces of the region; then they hide each other by their own depth alone. get_labels runs on every
+    redraw, too: short texts and the places in the world (3,) beside which they stand while overlays are shown.
     """
     global _active
     if _active is not None:
-        _active.get_draw_list, _active.is_complete = get_draw_list, is_complete
+        _active.get_draw_list, _active.is_complete, _active.get_labels = get_draw_list, is_complete, get_labels
     else:
-        _active = _Viewport(get_draw_list, is_complete)
-        for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW")):
+        _active = _Viewport(get_draw_list, is_complete, get_labels)
+        for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW"),
+                               (_draw_labels, "POST_PIXEL")):
             _active.handlers.append(SPACE.draw_handler_add(handler, (), "WINDOW", phase))
     redraw()
 
@@ -138,6 +153,28 @@ def _draw_region() -> None:
         viewport.status.objects, viewport.status.error = len(items), ""
     except PRTError as error:  # nobody can catch it here; the panel shows it
         viewport.status.objects, viewport.status.error = 0, str(error)
+
+
+def _draw_labels() -> None:
+    """POST_PIXEL: write the labels beside their places."""
+    viewport, region, space = _active, bpy.context.region, bpy.context.space_data
+    if viewport is None or region is None or not space.overlay.show_overlays:
+        return
+    scale, font = bpy.context.preferences.system.ui_scale, 0
+    sidebars = [other.width for other in bpy.context.area.regions if other.type == "UI" and other.width > 1]
+    blf.size(font, LABEL_SIZE * scale)
+    blf.enable(font, blf.SHADOW)
+    for text, place in viewport.get_labels():
+        where = location_3d_to_region_2d(region, bpy.context.region_data, Vector(place))
+        if where is None:  # behind the viewer
+            continue
+        aside, width = LABEL_OFFSET[0] * scale, blf.dimensions(font, text)[0]
+        fits = where.x + aside + width < region.width - sum(sidebars)
+        blf.color(font, 1.0, 0.75, 0.2, 1.0)
+        blf.shadow(font, 3, 0.0, 0.0, 0.0, 0.9)
+        blf.position(font, where.x + aside if fits else where.x - aside - width, where.y + LABEL_OFFSET[1] * scale, 0.0)
+        blf.draw(font, text)
+    blf.disable(font, blf.SHADOW)
 
 
 def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu.types.GPUFrameBuffer | None) -> None:

@@ -5,7 +5,8 @@
     bake_session.py    one bake from a scene to stored data, around the child process: for the operator and the command
     job_mixin.py       the one place that knows modal timers, Esc, status text and progress
     bake.py            prt.bake, prt.cancel        clear.py    prt.clear        analyze.py    prt.analyze
-    preview.py         prt.toggle_preview
+    preview.py         prt.toggle_preview          relight.py  prt.relight
+    scene_lamps.py     lamps on bakes, step by step; relit.py: a scene's bakes under its light, all at once
     live_preview.py    what the viewport draws, and the handlers that make it follow the scene and its light
     commands.py        the command line: `main(arguments) -> int`; verbs.py: what each verb does
 """

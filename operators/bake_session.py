@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
 from ..prt_addon.baking.local_lights import fit_to_lamps
+from ..prt_addon.baking.memory import memory_warning
 from ..prt_addon.baking.plan import make_plan
 from ..prt_addon.baking.process import BakeProcess
 from ..prt_addon.baking.recipe import BakeResult, transport_settings
@@ -67,6 +68,10 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
     scene = read_scene(depsgraph, settings, targets)
     settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
     plan = make_plan(scene, transport_settings(settings), reference_light(depsgraph))
+    try:
+        too_much = memory_warning(plan, settings)
+    except BadScene as error:  # an analysis tells it and goes on
+        too_much = f"{error.cause}. {error.remedy}"
     return {
         "objects": [o.name for o in scene.objects if o.is_target],
         "casters": len(scene.objects),
@@ -76,7 +81,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   "channels": plan.needs.channels, "order": plan.needs.order},
         "left_out": [asdict(item) for item in plan.needs.left_out],
         "hints": list(plan.needs.hints),
-        "warnings": [*scene.warnings, *left_out],
+        "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *left_out],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
         "rays": sum(plan.rays.values()),
@@ -92,7 +97,9 @@ def analysis_lines(analysis: dict[str, Any]) -> list[str]:
              f"{analysis['peak_bytes'] / 1e6:.0f} MB of memory and {analysis['disk_bytes'] / 1e6:.0f} MB of disk while "
              f"baking, {analysis['stored_bytes'] / 1e6:.1f} MB stored"]
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
-    return lines + analysis["hints"] + analysis["warnings"]
+    told = [line for line in analysis["warnings"] if line.startswith("Bake: ")]  # of memory: first, as it may end it
+    rest = [line for line in analysis["warnings"] if line not in told]
+    return lines[:1] + told + lines[1:] + analysis["hints"] + rest
 
 
 @dataclass
@@ -191,7 +198,7 @@ def baked_message(result: BakeResult, seconds: float) -> str:
         errors = {name: entry["relative_rms"] for name, entry in (report.get(key) or {}).items()}
         if errors.get("basis", 0.0) > 0.5 * errors.get("total", 0.0):
             if key == "local_errors" or report["settings"]["lighting"] == "local":
-                return f"{text}, mostly because the light cloud has few lights"
+                return f"{text}, mostly because lamps are put together from few columns"
             subject = "" if part == "diffuse" else ", in highlights"
             return f"{text}, mostly because the light is sharper than the order can show{subject}"
     return text

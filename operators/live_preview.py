@@ -23,14 +23,17 @@ from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
+from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
-from .scene_lamps import SceneLamps, lamps_signature
+from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
 
 SHORTEST_WAIT = 0.02  # seconds between a change and its evaluation
 STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watches it
+STILL_SECONDS = 0.25  # after its last move a lamp counts as let go, and its soft shadows are refined
 NOTE_WAIT = 1.0  # after a redraw was asked for, its outcome is known
+OUTSIDE_LABEL = "outside the light cloud: no bounced light"
 SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
@@ -53,8 +56,11 @@ class Live:
     shown: dict[str, Shown] = field(default_factory=dict)
     light: NDArray[np.float64] | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
+    lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
     lamps_time: float = 0.0
+    moving: set[str] = field(default_factory=set)
+    moved_time: float = 0.0
     signature: Hashable = None
     rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
     light_seconds: float = 0.0
@@ -84,7 +90,7 @@ def enable() -> None:
     """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
     _read_bakes()
     _read_light()
-    viewport.enable(draw_list, shows_everything)
+    viewport.enable(draw_list, shows_everything, labels)
     assign(session(), preview=True, preview_message="")
 
 
@@ -92,6 +98,12 @@ def disable() -> None:
     """Back to Blender's own picture."""
     viewport.disable()
     assign(session(), preview=False, preview_message="")
+
+
+def settled() -> bool:
+    """Whether nothing is left to be done: what was noted is evaluated, no light fades, no soft shadow is coarse."""
+    dirty = _live.bakes_dirty or _live.stale_dirty or (session().preview and _live.light_dirty)
+    return not dirty and not _live.moving
 
 
 def draw_list() -> list[DrawItem]:
@@ -117,6 +129,12 @@ def shows_everything() -> bool:
     return all(found.name in _live.shown or found.type not in SURFACE_TYPES or not found.visible_in_viewport_get(space)
                or found.display_type in ("BOUNDS", "WIRE")
                for found in bpy.context.view_layer.objects)
+
+
+def labels() -> list[tuple[str, tuple[float, ...]]]:
+    """What is written beside lamps: those outside of the cloud."""
+    outside = _live.lamps.outside if _live.shown else set()
+    return [(OUTSIDE_LABEL, tuple(lamp.position)) for lamp in _live.lamps_read if lamp.name in outside]
 
 
 def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -149,18 +167,49 @@ def _read_bakes() -> None:
         if baked is None:
             continue
         line.clusters, line.points = int(baked.bases.shape[0]), len(baked.cluster)
-        own, coherence = baked.header.get("own_errors", {}), baked.header.get("coherence") or {}
-        for name, part, key in (("error", "diffuse", "errors"), ("highlight_error", "highlights", "highlight_errors")):
-            # The object's own error; where it had too few points to measure one, those of the whole bake.
-            whole = -1.0 if own or (part == "highlights" and not baked.functions) else \
-                baked.header.get(key, {}).get("total", -1.0)
-            setattr(line, name, float(own.get(part, whole)))
+        coherence = baked.header.get("coherence") or {}
+        line.error, line.highlight_error, line.lamp_error, line.lamp_highlight_error = _errors_of(baked)
         line.overdraw = float(coherence.get("both", 0.0))
         line.overdraw_before = float(coherence.get("before", 0.0))
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
         line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
         _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)))
+    assign(state, cloud="\n".join(_cloud_lines()))
     _read_stale()
+
+
+def _cloud_lines() -> list[str]:
+    """What the light clouds of the bakes are; with their objects where there are several."""
+    owners: dict[str, list[str]] = {}
+    for name, shown in _live.shown.items():
+        if shown.baked.cloud is not None:
+            owners.setdefault(cloud_key(shown.baked), []).append(name)
+    lines = []
+    for names in owners.values():
+        if len(owners) > 1:
+            lines.append(f"{names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}:")
+        lines += cloud_lines(_live.shown[names[0]].baked.cloud).splitlines()
+    return lines
+
+
+def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
+    """Measured errors of diffuse light, highlights, lamps' bounced light and highlights of that; -1 for what was not
+    measured.
+
+    The object's own errors; where it had too few points to measure one, those of the whole bake.
+    """
+    header, own = baked.header, baked.header.get("own_errors", {})
+    only_lamps = header.get("settings", {}).get("lighting") == "local"
+    keys = {"diffuse": None if only_lamps else "errors",
+            "highlights": "highlight_errors" if baked.functions else None,
+            "bounced light of lamps": "errors" if only_lamps else "local_errors",
+            "highlights of lamps": "local_highlight_errors" if baked.functions else None}
+    found = []
+    for part, key in keys.items():
+        mine = own.get("diffuse" if only_lamps and key == "errors" else part) if key else None
+        whole = header.get(key, {}).get("total", -1.0) if key and not own else -1.0
+        found.append(float(whole if mine is None else mine))
+    return tuple(found)
 
 
 def _read_stale() -> None:
@@ -209,16 +258,39 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     now, baked = time.perf_counter(), {name: shown.baked for name, shown in _live.shown.items()}
     lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time)
     _live.lamps_time = now
-    signature = lamps_signature(lamps)
+    _note_moves(lamps, now)
+    signature = lamps_signature(lamps), frozenset(_live.moving)
     if signature != _live.lamps_signature or any(
             shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature = signature
         for name, shown in _live.shown.items():
-            shown.direct = _live.lamps.direct(name, shown.baked, lamps)
+            shown.direct = _live.lamps.direct(name, shown.baked, lamps, _live.moving)
         viewport.redraw()
     if not _live.lamps.settled:
         _live.light_dirty = True
         viewport.redraw()
+
+
+def _note_moves(lamps: list[LocalLight], now: float) -> None:
+    """Find out which lamps are being dragged, and see to it that their soft shadows are refined afterwards."""
+    moved = moved_lamps(lamps, _live.lamps_read)
+    _live.lamps_read = lamps
+    if moved:
+        _live.moving, _live.moved_time = _live.moving | moved, now
+        if not bpy.app.background and not bpy.app.timers.is_registered(_refine):
+            bpy.app.timers.register(_refine, first_interval=STILL_SECONDS, persistent=True)
+    elif now - _live.moved_time >= STILL_SECONDS:
+        _live.moving = set()
+
+
+def _refine() -> float | None:
+    """Once no lamp moves any more, have their light evaluated as if none had; the seconds until it is to ask again."""
+    left = _live.moved_time + STILL_SECONDS - time.perf_counter()
+    if left > 0.0:
+        return left
+    if _live.moving:
+        light_changed()
+    return None
 
 
 def _schedule(wait: float) -> None:
@@ -313,7 +385,7 @@ def unregister() -> None:
     """Leave no handler, timer or GPU object behind."""
     for handlers, handler in HANDLERS:
         handlers.remove(handler)
-    for timer in (_catch_up, _note_viewport):
+    for timer in (_catch_up, _note_viewport, _refine):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     disable()

@@ -11,7 +11,7 @@ from .properties import session
 
 
 class PRT_OT_toggle_preview(bpy.types.Operator):
-    """Show baked objects in the viewport as the World and the Suns light them now, and follow their changes.
+    """Show baked objects in the viewport as World, Suns and lamps light them now, and follow their changes.
     Costs about as much per frame as a coloured mesh"""
 
     bl_idname = "prt.toggle_preview"

@@ -28,6 +28,12 @@ LIGHTING_ITEMS = (
                               "Costs one more solution for each light of the cloud", 1),
     ("both", "Both", "World, Suns and lamps that move. Costs both bakes, and one set of data holds both", 2),
 )
+LAMP_BASIS_ITEMS = (
+    ("surfaces", "Lit Surfaces", "The surfaces that lamps shine on, found by shadow rays when relighting: right for "
+                                 "lamps of all kinds at any place. Costs shadow rays for each lamp that moves", 0),
+    ("cloud", "Light Cloud", "Lights of a cloud, between which a lamp is interpolated: a little faster to relight, "
+                             "less exact near to surfaces, and without bounced light outside of the cloud", 1),
+)
 LIGHTINGS = {"environment": "environment", "local": "local", "both": "environment,local"}
 GLOSSY_ROWS_ITEMS = (
     ("0", "None", "Only diffuse light: metal is black. The fastest, and the least data", 0),
@@ -38,8 +44,9 @@ GLOSSY_ROWS_ITEMS = (
     ("25", "25 Functions", "One function more than 24, for next to nothing gained: to compare with published data", 5),
 )
 # What presets differ in, and so fill in; the rest belongs to the scene rather than to the quality, and stays.
-QUALITY = ("order", "glossy_rows", "glossy_albedo", "cloud_lights", "merge_response")
-# What goes into a bake under its own name.
+QUALITY = ("order", "glossy_rows", "glossy_albedo", "surface_columns", "cloud_lights",
+           "merge_response")
+# What goes into a bake under its own name, words apart from numbers.
 OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "cloud_spacing", "zone_receivers")
 # Blender keeps floats in single precision.
 ROUNDING = 1e-6
@@ -129,6 +136,15 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "Serves exports to renderers that draw cluster by cluster; the preview does not need it. 0 is off",
     )
 
+    lamp_basis: EnumProperty(
+        name="Lamps By", items=LAMP_BASIS_ITEMS, default=PRESETS["standard"].lamp_basis,
+        description="What stands for lamps in the bake",
+    )
+    surface_columns: IntProperty(
+        name="Columns", min=1, max=1024, default=PRESETS["standard"].surface_columns,
+        description="Ways in which the light of lamps can differ after a bounce. More follow lamps near to surfaces "
+                    "and behind openings; every cluster holds them, so data and time grow with them",
+    )
     cloud_region: PointerProperty(
         name="Region", type=bpy.types.Object, poll=_may_bound,
         description="A cube empty, or a mesh hidden in renders, within which lamps will move. A small region buys a "
@@ -165,6 +181,8 @@ class PRTSettings(bpy.types.PropertyGroup):
         preset = PRESETS[self.preset]
         changed = {name: _text(getattr(self, name)) for name in OWN_NAMES
                    if abs(float(getattr(self, name)) - float(getattr(preset, name))) > ROUNDING}
+        if self.lamp_basis != preset.lamp_basis:
+            changed["lamp_basis"] = self.lamp_basis
         if not self.bounces:
             changed["bounces"] = "0"
         if LIGHTINGS[self.lighting] != preset.lighting:
@@ -187,6 +205,8 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     points: IntProperty()
     error: FloatProperty(default=-1.0)
     highlight_error: FloatProperty(default=-1.0)
+    lamp_error: FloatProperty(default=-1.0)
+    lamp_highlight_error: FloatProperty(default=-1.0)
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
     error_spent: FloatProperty()
@@ -206,6 +226,7 @@ class PRTSession(bpy.types.PropertyGroup):
     preview_message: StringProperty()
     viewport_message: StringProperty()
     objects: CollectionProperty(type=PRTBakedObject)
+    cloud: StringProperty()
     analysis: StringProperty()
 
 

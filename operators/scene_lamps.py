@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Container, Hashable, Sequence
 from dataclasses import dataclass, field
 
 import bpy
@@ -12,13 +12,27 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
+from ..prt_addon.blender.visibility import render_visible_objects
+from ..prt_addon.lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..prt_addon.lighting.local_lights import LocalLight
-from ..prt_addon.relighting.lamp_light import AT_ONCE, CloudLight, DirectLight, LampLight
+from ..prt_addon.relighting.lamp_light import (
+    AT_ONCE,
+    QUICK_SAMPLES,
+    SHADOW_SAMPLES,
+    CloudLight,
+    DirectLight,
+    LampLight,
+    SurfaceLamps,
+    lamp_shape,
+    lamps_in,
+)
+from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
 from ..prt_addon.tracing.tracer import Tracer
 
+HIDDEN = "Lamps: all objects that are baked for them are hidden in renders, so they light nothing"
 OUTSIDE = "{}: outside the light cloud, so it is shown without bounced light"
 UNLIT = "{}: too far from the light cloud's lights in sight for part of the scene's bounced light"
 
@@ -28,7 +42,7 @@ class SceneLamps:
     """Lamps on baked objects. Everything that depends on geometry is kept until `forget_geometry`."""
 
     _tracer: Tracer | None = None
-    _clouds: dict[str, LampLight] = field(default_factory=dict)
+    _clouds: dict[str, LampLight | SurfaceLamps] = field(default_factory=dict)
     _lit: dict[str, CloudLight] = field(default_factory=dict)
     _direct: dict[str, DirectLight] = field(default_factory=dict)
 
@@ -47,23 +61,35 @@ class SceneLamps:
         """
         near = {name: b for name, b in baked.items() if b.cloud is not None}
         if not near:
+            self._lit = {}
+            return []
+        visible = {found.name for found in render_visible_objects(depsgraph.view_layer).values()}
+        casting = [name for name in near if name in visible]
+        if not casting:
+            self._lit = {}
+            warnings.append(HIDDEN)
             return []
         lamps = read_local_lights(depsgraph, warnings)
         if self._tracer is None:
-            scene = SceneMesh.assemble(read_objects(depsgraph, list(near), []), 0.0)
+            scene = SceneMesh.assemble(read_objects(depsgraph, casting, []), 0.0)
             # In Blender's own process nothing starts threads (design/architecture.md).
             self._tracer = Tracer(scene.points, scene.triangles, threads=1)
         self._lit = {}
         for transfer in near.values():
-            key = _cloud_key(transfer)
+            key = cloud_key(transfer)
             if key in self._lit:
                 continue
             if key not in self._clouds:
-                self._clouds[key] = LampLight(transfer.cloud, self._tracer)
+                self._clouds[key] = lamps_in(transfer.cloud, self._tracer)
             self._lit[key] = self._clouds[key].step(lamps, seconds)
         for found in self._lit.values():
             warnings += [OUTSIDE.format(name) for name in found.outside] + [UNLIT.format(name) for name in found.unlit]
         return lamps
+
+    @property
+    def outside(self) -> set[str]:
+        """Names of lamps that light without bounces."""
+        return {name for found in self._lit.values() for name in found.outside}
 
     @property
     def settled(self) -> bool:
@@ -72,23 +98,51 @@ class SceneLamps:
 
     def cloud_light(self, baked: BakedTransfer) -> NDArray[np.float32] | None:
         """The lamps' light (zones, columns, 3) in the cloud of a bake; None without a cloud."""
-        found = self._lit.get(_cloud_key(baked)) if baked.cloud is not None else None
+        found = self._lit.get(cloud_key(baked)) if baked.cloud is not None else None
         return None if found is None else found.values
 
-    def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight]) -> NDArray[np.float32] | None:
-        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud."""
-        if baked.cloud is None:
+    def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
+               moving: Container[str] = ()) -> NDArray[np.float32] | None:
+        """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud, or before `step`.
+
+        moving: keys of lamps that are being dragged, whose soft shadows may be coarse.
+        """
+        if baked.cloud is None or self._tracer is None:
             return None
         if name not in self._direct:
             self._direct[name] = DirectLight(self._tracer, baked)
-        return self._direct[name].of(lamps)
+        samples = [QUICK_SAMPLES if lamp.key in moving else SHADOW_SAMPLES for lamp in lamps]
+        return self._direct[name].of(lamps, samples)
 
 
 def lamps_signature(lamps: Sequence[LocalLight]) -> Hashable:
     """Changes when a lamp does."""
-    return tuple((lamp.key, lamp.kind, lamp.matrix.tobytes(), lamp.power.tobytes(), lamp.radius, lamp.soft_falloff,
-                  lamp.spot_angle, lamp.spot_blend, lamp.shape, lamp.size, lamp.spread, lamp.shadow) for lamp in lamps)
+    return tuple((lamp.key, lamp_shape(lamp), lamp.power.tobytes()) for lamp in lamps)
 
 
-def _cloud_key(baked: BakedTransfer) -> str:
+def moved_lamps(lamps: Sequence[LocalLight], before: Sequence[LocalLight]) -> set[str]:
+    """Keys of lamps with soft shadows that are elsewhere, or of another shape, than before. New ones are not."""
+    shapes = {lamp.key: lamp_shape(lamp) for lamp in before}
+    return {lamp.key for lamp in lamps if lamp.extent > 0.0 and shapes.get(lamp.key, lamp_shape(lamp))
+            != lamp_shape(lamp)}
+
+
+def cloud_key(baked: BakedTransfer) -> str:
+    """The same for bakes with the same light cloud or lit surfaces."""
+    if isinstance(baked.cloud, LitSurfaces):
+        return digest_arrays(baked.cloud.corners, baked.cloud.patch, baked.cloud.axes)
     return digest_arrays(baked.cloud.positions, baked.cloud.zone_starts, baked.cloud.dense)
+
+
+def cloud_lines(cloud: LocalBasis) -> str:
+    """What a light cloud is, or lit surfaces are, in short lines for the panel."""
+    if isinstance(cloud, LitSurfaces):
+        return (f"{plural(cloud.axes.shape[1], 'patch', 'patches')} of lit surfaces\n"
+                f"{plural(len(cloud.corners), 'triangle', 'triangles')}\n{plural(cloud.columns, 'column', 'columns')}")
+    kept = np.diff(cloud.zone_starts)
+    merged = f"{kept.min()}" if kept.min() == kept.max() else f"{kept.min()} to {kept.max()}"
+    zones = "1 zone" if len(kept) == 1 else f"{len(kept)} zones"
+    functions = cloud.emission_order ** 2
+    each = "" if functions == 1 else f", {functions} for each light"
+    return (f"{plural(len(cloud.dense), 'light', 'lights')} every {cloud.spacing:.3g} m\n"
+            f"merged to {merged} in {zones}\n{plural(cloud.columns, 'column', 'columns')}{each}")

@@ -12,22 +12,16 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
-from numpy.typing import NDArray
 
 from ..prt_addon.baking.process import raise_error
 from ..prt_addon.baking.settings import BakeSettings, make_settings
-from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import environment_picture, light_coefficients
+from ..prt_addon.blender.lights import environment_picture
 from ..prt_addon.blender.save import save_blend
-from ..prt_addon.blender.stored import baked_objects, read_baked, stale
-from ..prt_addon.errors import BadArguments, BadScene, StorageError
-from ..prt_addon.relighting.exit_radiance import view_radiance
-from ..prt_addon.relighting.scene_light import joined_light
+from ..prt_addon.errors import BadArguments, StorageError
 from ..prt_addon.reporting.headline import headline
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
@@ -35,7 +29,7 @@ from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.files import save_arrays, save_json, write_atomically
 from .bake_session import BakeSession, analyze_scene
 from .job_mixin import progress_text
-from .scene_lamps import SceneLamps
+from .relit import Lit, read_all, relit
 
 PROGRESS_SECONDS = 1.0  # between two lines of progress of one stage
 
@@ -77,9 +71,9 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
     """
     _check_output(arguments.output, (".npz",), arguments.input)
     scene = _open(arguments.input)
-    baked = _read_all(scene, arguments.input)
+    baked = read_all(scene, str(arguments.input))
     lit = _lit(scene, baked, arguments, arguments.use_scene_lights)
-    radiances = [view_radiance(b, lit.light[name], b.normals, lit.direct[name]) for name, b in baked.items()]
+    radiances = [lit.radiance(name, b) for name, b in baked.items()]
     save_arrays(arguments.output, {
         "radiance": np.concatenate(radiances).astype(np.float32),
         "position": np.concatenate([b.positions for b in baked.values()]),
@@ -97,7 +91,7 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
 
     _check_output(arguments.output, (".png",), arguments.input)
     scene = _open(arguments.input)
-    baked = _read_all(scene, arguments.input)
+    baked = read_all(scene, str(arguments.input))
     lit = _lit(scene, baked, arguments, use_scene_lights=True)
     percentage = scene.render.resolution_percentage / 100.0
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
@@ -134,7 +128,7 @@ def export(arguments: argparse.Namespace) -> Iterator[str]:
         raise BadArguments(str(folder), "it is a file", "Give a folder")
     _check_folder(folder.absolute().parent)
     scene = _open(arguments.input)
-    baked = _read_all(scene, arguments.input)
+    baked = read_all(scene, str(arguments.input))
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -233,51 +227,15 @@ def _follow(session: BakeSession) -> None:
             print(f"prt: {progress_text(message)}", file=sys.stderr, flush=True)
 
 
-def _read_all(scene: bpy.types.Scene, path: Path) -> dict[str, BakedTransfer]:
-    """The baked data of all objects by name. Raises where there is none, or where it is stale: never silently used."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    around = surroundings(depsgraph)
-    found: dict[str, BakedTransfer] = {}
-    for baked_object in baked_objects(scene):
-        transfer = read_baked(baked_object)
-        if transfer is None:
-            continue
-        why = stale(baked_object, depsgraph, around)
-        if why:
-            raise BadScene(baked_object.name, f"its bake is stale: {why}", "Bake it again")
-        found[baked_object.name] = transfer
-    if not found:
-        raise BadScene(str(path), "no object in it is baked", "Bake it first with `prt bake`")
-    return found
-
-
-@dataclass(frozen=True)
-class _Lit:
-    """By name of the baked object: light in its columns, and direct light of lamps (None for none)."""
-
-    light: dict[str, NDArray[np.float32]]
-    direct: dict[str, NDArray[np.float32] | None]
-
-
 def _lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: argparse.Namespace,
-         use_scene_lights: bool) -> _Lit:
+         use_scene_lights: bool) -> Lit:
     """The light that the arguments ask for, with its warnings on stderr."""
     if not math.isfinite(arguments.rotate):
         raise BadArguments("--rotate", f"{arguments.rotate} is no angle", "Give degrees")
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    order = max(b.lighting_basis.order for b in baked.values())
-    distant, warnings = None, []
-    if order:
-        found = light_coefficients(scene, depsgraph, order, arguments.environment, arguments.rotate, use_scene_lights,
-                                   arguments.window, all(b.cloud is None for b in baked.values()))
-        distant, warnings = found.coefficients, list(found.warnings)
-    scene_lamps = SceneLamps()
-    lamps = scene_lamps.step(baked, depsgraph, warnings) if use_scene_lights else []
-    for warning in dict.fromkeys(warnings):
+    lit = relit(scene, baked, arguments.environment, arguments.rotate, use_scene_lights, arguments.window)
+    for warning in lit.warnings:
         print(f"prt: warning: {warning}", file=sys.stderr, flush=True)
-    local = {name: scene_lamps.cloud_light(b) if lamps else None for name, b in baked.items()}
-    return _Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
-                {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()})
+    return lit
 
 
 def _file_name(name: str) -> str:

@@ -34,7 +34,9 @@ class PRT_PT_bake(_Sidebar, bpy.types.Panel):
         column.enabled = not session.running
         column.prop(settings, "preset")
         column.prop(settings, "lighting")
-        column.prop(settings, "order")
+        distant = column.column()
+        distant.active = settings.lighting != "local"  # lamps of a cloud know no order
+        distant.prop(settings, "order")
         column.prop(settings, "bounces")
         if session.running:
             layout.label(text=session.stage)
@@ -45,11 +47,11 @@ class PRT_PT_bake(_Sidebar, bpy.types.Panel):
             row.operator("prt.bake", text="Bake", icon="RENDER_STILL")
             row.operator("prt.analyze", icon="VIEWZOOM")
         if session.message:
-            _wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
+            wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
         if session.analysis:
             box = layout.box()
             for line in session.analysis.splitlines():
-                _wrapped(box, context, line)
+                wrapped(box, context, line)
 
 
 class _Expert(_Sidebar):
@@ -98,6 +100,10 @@ class PRT_PT_local_lights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
+        column.prop(settings, "lamp_basis")
+        by_cloud = settings.lamp_basis == "cloud"
+        if not by_cloud:
+            column.prop(settings, "surface_columns")
         column.prop(settings, "cloud_region")
         several = column.column()
         several.active = settings.cloud_region is None
@@ -106,8 +112,9 @@ class PRT_PT_local_lights(_Expert, bpy.types.Panel):
         lights.active = settings.cloud_spacing == 0.0
         lights.prop(settings, "cloud_lights")
         column.prop(settings, "cloud_spacing")
-        column.prop(settings, "merge_response")
-        column.prop(settings, "zone_receivers")
+        if by_cloud:
+            column.prop(settings, "merge_response")
+            column.prop(settings, "zone_receivers")
 
 
 class PRT_PT_preview(_Sidebar, bpy.types.Panel):
@@ -126,8 +133,11 @@ class PRT_PT_preview(_Sidebar, bpy.types.Panel):
         column.active = session.preview
         column.prop(context.scene.prt, "exposure")
         column.prop(context.scene.prt, "window")
-        for line in (*session.preview_message.splitlines(), *session.viewport_message.splitlines()):
-            _wrapped(layout, context, line, "INFO")
+        for line in session.preview_message.splitlines():
+            wrapped(layout, context, line, "ERROR" if "outside the light cloud" in line else "INFO")
+        for line in session.viewport_message.splitlines():
+            wrapped(layout, context, line, "INFO")
+        layout.operator("prt.relight", icon="GROUP_VCOL")
 
 
 class PRT_PT_results(_Sidebar, bpy.types.Panel):
@@ -141,6 +151,10 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
         if not session.objects:
             layout.label(text="Nothing is baked yet", icon="INFO")
             return
+        if session.cloud:
+            box = layout.box().column(align=True)
+            for number, line in enumerate(session.cloud.splitlines()):
+                box.label(text=line, icon="BLANK1" if number else "LIGHT")
         column = layout.box().column(align=True)
         for line in session.objects[:ROWS]:
             row = column.row()
@@ -149,7 +163,7 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
             for details in _details(line):
                 column.label(text=details, icon="BLANK1")
             if line.stale:
-                _wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
+                wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
         if len(session.objects) > ROWS:
             column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
         layout.operator("prt.clear", icon="TRASH")
@@ -158,8 +172,9 @@ class PRT_PT_results(_Sidebar, bpy.types.Panel):
 def _details(line: bpy.types.PropertyGroup) -> list[str]:
     """What came out for one object, in short lines."""
     lines = [_plural(line.clusters, "cluster")] * bool(line.clusters)
-    lines += [f"{part} error {100.0 * value:.2f} %"
-              for value, part in ((line.error, "diffuse"), (line.highlight_error, "highlight")) if value >= 0.0]
+    errors = ((line.error, "diffuse"), (line.highlight_error, "highlight"), (line.lamp_error, "lamps'"),
+              (line.lamp_highlight_error, "lamps' highlight"))
+    lines += [f"{part} error {100.0 * value:.2f} %" for value, part in errors if value >= 0.0]
     if line.overdraw > 0.0:
         lines.append(f"overdraw {line.overdraw_before:.2f} to {line.overdraw:.2f}")
         lines.append(f"for {100.0 * line.error_spent:.1f} % of squared error")
@@ -180,7 +195,7 @@ def _progress(session: bpy.types.PropertyGroup) -> str:
     return text if session.seconds_left < 0.0 else f"{text}, {session.seconds_left:.0f} s left"
 
 
-def _wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE",
+def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE",
              alert: bool = False) -> None:
     """A text over as many lines as the sidebar's width asks for: labels are clipped otherwise."""
     scale = context.preferences.system.ui_scale

@@ -17,7 +17,7 @@ from ..basis.directions import disc_directions, tangent_frames
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Hits, Tracer
 from ..transport.glossy import surface_frames
-from ..transport.path_reference import SURE_BOUNCES, DistantSuns, Emission, surface_at
+from ..transport.path_reference import SURE_BOUNCES, DistantSuns, Emission, PointLights, surface_at
 from .highlight_sampling import TrueHighlight, above_horizon, cosine_directions, to_local, to_world
 from .surfaces import SurfacePlan
 
@@ -77,14 +77,15 @@ class _Met:
 
 
 def arriving_radiance(surfaces: TrueSurfaces, origins: NDArray[np.float32], directions: NDArray[np.float32],
-                      emission: Emission, suns: DistantSuns, bounces: int, glossy_hits: tuple[int, ...],
+                      emission: Emission, suns: DistantSuns | PointLights, bounces: int, glossy_hits: tuple[int, ...],
                       seed: list[int]) -> tuple[Array, int]:
     """Radiance (n, len(glossy_hits), values, 3) that arrives along rays (n, 3) against their directions, and the number
     of rays traced.
 
     emission: of what lies beyond the scene, (n, values, 3); suns light what is hit, in the last value (a ray that meets
-    a sun itself does not see it: the receiver adds that). bounces: most, -1 for all (Russian roulette). glossy_hits: at
-    how many hits of a path glossy surfaces show their true highlights, 1 on fronts alone, as a bake records it.
+    a sun itself does not see it: the receiver adds that), point lights each in its own value. bounces: most, -1 for all
+    (Russian roulette). glossy_hits: at how many hits of a path glossy surfaces show their true highlights, 1 on fronts
+    alone, as a bake records it.
     """
     hits = surfaces.tracer.nearest(origins, directions)
     escaped = np.flatnonzero(hits.triangle < 0)
@@ -101,8 +102,8 @@ def arriving_radiance(surfaces: TrueSurfaces, origins: NDArray[np.float32], dire
     return np.moveaxis(total, 0, 1), rays
 
 
-def _follow(surfaces: TrueSurfaces, rays: _Rays, hits: Hits, emission: Emission, suns: DistantSuns, bounces: int,
-            glossy: int, total: Array, generator: np.random.Generator) -> int:
+def _follow(surfaces: TrueSurfaces, rays: _Rays, hits: Hits, emission: Emission, suns: DistantSuns | PointLights,
+            bounces: int, glossy: int, total: Array, generator: np.random.Generator) -> int:
     """Add to total (n, values, 3) what the rays bring from their first hit on; returns the rays traced."""
     traced, depth = 0, 0
     while depth != bounces:
@@ -112,7 +113,10 @@ def _follow(surfaces: TrueSurfaces, rays: _Rays, hits: Hits, emission: Emission,
         rays = rays.subset(met)
         place = _met(surfaces, rays, hits, met)
         shiny = _shiny(surfaces, place, depth, glossy)
-        traced += _add_suns(surfaces, rays, place, shiny, suns, total, generator)
+        if isinstance(suns, PointLights):
+            traced += _add_points(surfaces, rays, place, shiny, suns, total)
+        else:
+            traced += _add_suns(surfaces, rays, place, shiny, suns, total, generator)
         rays = _scattered(surfaces, rays, place, shiny, generator)
         if depth >= SURE_BOUNCES:
             rays = _roulette(rays, generator)
@@ -178,6 +182,27 @@ def _add_suns(surfaces: TrueSurfaces, rays: _Rays, place: _Met, shiny: dict[int,
         for number, members in shiny.items():
             returned[members] += surfaces.highlights[number].evaluate(place.views[members], local[members])
         total[rays.path[lit], -1] += rays.throughput[lit] * returned[lit] * (scale * irradiance)
+    return traced
+
+
+def _add_points(surfaces: TrueSurfaces, rays: _Rays, place: _Met, shiny: dict[int, NDArray[np.int64]],
+                lights: PointLights, total: Array) -> int:
+    """Add the point lights' light that these places send back, each to its own value; returns the rays traced."""
+    traced, diffuse = 0, _diffuse(surfaces, place, shiny)
+    for value, position in enumerate(surfaces.tracer.to_tracing_space(lights.positions)):
+        way = position - place.origins
+        square = np.sum(way.astype(np.float64) ** 2, axis=1)
+        towards = way / np.sqrt(square)[:, None]
+        local = to_local(towards, place.frames)
+        which = np.flatnonzero((local[:, 2] > 0.0) & (np.sum(place.faces * towards, axis=1) > 0.0))
+        reach = np.full(len(which), 1.0 - 1e-5, np.float32)
+        lit = which[~surfaces.tracer.occluded(place.origins[which], way[which], reach)]
+        traced += len(which)
+        returned = diffuse * (np.maximum(local[:, 2:], 0.0) / np.pi)
+        for number, members in shiny.items():
+            returned[members] += surfaces.highlights[number].evaluate(place.views[members], local[members])
+        strength = 1.0 / (square[lit] * surfaces.tracer.diagonal ** 2)
+        total[rays.path[lit], value] += rays.throughput[lit] * returned[lit] * strength[:, None]
     return traced
 
 

@@ -26,21 +26,23 @@ from ..lighting.light_clustering import (
     merged_response,
     mutual_visibility,
 )
+from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..lighting.local_lights import LocalLight
 from ..lighting.zones import split_zones
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.gather import Gather
-from ..transport.glossy import GlossySurfaces, reflected_light
+from ..transport.glossy import reflected_light
 from ..transport.incident_light import DiffuseRadiance, IndirectLight
 from ..transport.local_lights import LightSolver
+from .leftovers import RESPONSES
+from .lit_highlights import LitHighlights
 from .local_budget import Probes, probe_positions
 from .settings import BakeSettings
+from .surface_transfer import surface_columns, surface_highlights
 
 # Parts of the progress that end with: the first solutions, merging (the rest: solutions at the merged places).
 SOLVED, MERGED, PROBED = 0.6, 0.7, 0.95
-# Name of the folder of responses on disk begins so.
-RESPONSES = "responses-"
 # Order of directional emission where the scene has lamps that need one: it costs four times an isotropic cloud, and
 # tells a spot's light before it from that behind it.
 ORDER_OF_SPOTS = 2
@@ -48,39 +50,19 @@ ORDER_OF_SPOTS = 2
 
 @dataclass(frozen=True)
 class LocalTransfer:
-    """cloud: with every zone's lights; zone: (points,) int32 of the scene's points, 0 where nothing is baked;
-    transfer: (points, columns, channels) float32, what reaches a point of the lights of its zone by at least one
-    bounce, for unit albedo, zero beyond the zone's last light; facts: for the report; points: (g,) of the scene that
-    have highlights; rows: (g, functions, columns, 1 or 3) float32, what these reflect of the surfaces that the lights
-    shine on. None without highlights;
-    probes: for the error budget."""
+    """cloud: with every zone's lights, or the lit surfaces that columns stand for; zone: (points,) int32 of the scene's
+    points, 0 where nothing is baked; transfer: (points, columns, channels) float32, what reaches a point of the lights
+    of its zone by at least one bounce, for unit albedo, zero beyond the zone's last light; facts: for the report;
+    points: (g,) of the scene that have highlights; rows: (g, functions, columns, 1 or 3) float32, what these reflect of
+    the surfaces that the lights shine on. None without highlights; probes: for the error budget."""
 
-    cloud: LightCloud
+    cloud: LocalBasis
     zone: NDArray[np.int32]
     transfer: NDArray[np.float32]
     facts: dict[str, Any]
     points: NDArray[np.int64] | None = None
     rows: NDArray[np.float32] | None = None
     probes: Probes | None = None
-
-
-@dataclass(frozen=True)
-class LitHighlights:
-    """The receivers with highlights of a bake with a light cloud.
-
-    points: (g,) of the scene; places: (g,) among the gather's receivers; surfaces: what reflects there; blocked: (g,
-    n^2), see `IndirectLight`.
-    """
-
-    points: NDArray[np.int64]
-    places: NDArray[np.int64]
-    surfaces: GlossySurfaces
-    blocked: NDArray[np.float32]
-
-    def of(self, which: NDArray[np.int64]) -> LitHighlights:
-        """Some of them."""
-        surfaces = replace(self.surfaces, frames=self.surfaces.frames[which], material=self.surfaces.material[which])
-        return LitHighlights(self.points[which], self.places[which], surfaces, self.blocked[which])
 
 
 def fit_to_lamps(settings: BakeSettings, lamps: Sequence[LocalLight]) -> tuple[BakeSettings, tuple[str, ...]]:
@@ -106,6 +88,8 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
     highlights: of receivers whose hits the gather kept. Raises BadScene where no light fits.
     """
     lights = _placed(tracer, scene, regions, settings)
+    if settings.lamp_basis == "surfaces":
+        return (yield from _by_surfaces(tracer, scene, gathered, albedo, keys, lights, settings, folder, highlights))
     zones = split_zones(scene.points[keys], settings.zone_receivers or max(1, len(keys)))
     zone = np.zeros(len(scene.points), np.int32)
     zone[keys] = zones.zone
@@ -152,27 +136,69 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
         rows = yield from _part(_solve_highlights(solver, cloud, set(missing), zone, members, highlights, transfer),
                                 middle, PROBED)
     if settings.error_receivers:
-        probes = yield from _part(_probes(solver, cloud, gathered, len(transfer), settings.seed), PROBED, 1.0)
+        probes = yield from _part(_probes(solver, lights, gathered, len(transfer), order, settings.seed), PROBED, 1.0)
     return LocalTransfer(cloud, zone, transfer, facts, points, rows, probes)
+
+
+def _by_surfaces(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, albedo: NDArray[np.float32] | None,
+                 keys: NDArray[np.int64], lights: PlacedLights, settings: BakeSettings, folder: Path | None,
+                 highlights: LitHighlights | None) -> Generator[float, None, LocalTransfer]:
+    """`local_transfer` in columns of lit surfaces; the lights of the cloud are some of the lamps that it learns from.
+    One zone and nothing merged: a column means the same everywhere."""
+    zone = np.zeros(len(scene.points), np.int32)
+    if gathered is None:
+        nothing = LitSurfaces(np.zeros((0, 3, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((1, 1), np.float32))
+        return LocalTransfer(nothing, zone, np.zeros((len(zone), 1, 1), np.float32),
+                             _surface_facts(lights, nothing, 0.0, 0))
+    solver = LightSolver(tracer, scene, gathered, albedo, settings.bounce_error, settings.bounces)
+    rows = _rows_of_points(gathered, len(zone))[keys]
+    end = MERGED if highlights is not None else PROBED
+    found = yield from _part(surface_columns(
+        tracer, scene, solver, rows, lights.positions, settings.surface_patches, settings.surface_columns,
+        settings.seed, folder), 0.0, end)
+    transfer = np.zeros((len(zone), found.surfaces.columns, albedo.shape[1]), np.float32)
+    transfer[keys] = found.transfer
+    points = shown = probes = None
+    if highlights is not None:
+        points = highlights.points
+        shown = yield from _part(surface_highlights(solver, found, highlights), end, PROBED)
+    if settings.error_receivers:
+        probes = yield from _part(_probes(solver, lights, gathered, len(zone), 1, settings.seed), PROBED, 1.0)
+    return LocalTransfer(found.surfaces, zone, transfer,
+                         _surface_facts(lights, found.surfaces, found.left, found.lamps), points, shown, probes)
+
+
+def _surface_facts(lights: PlacedLights, surfaces: LitSurfaces, left: float, lamps: int) -> dict[str, Any]:
+    """What the report tells."""
+    return {"basis": "surfaces", "patches": int(surfaces.axes.shape[1]), "triangles": len(surfaces.corners),
+            "columns": surfaces.columns, "left": left, "lamps": lamps, "warnings": list(lights.warnings)}
 
 
 def packed_local(local: LocalTransfer) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """Arrays and header of a finished stage."""
     cloud = local.cloud
-    arrays = {"positions": cloud.positions, "zone_starts": cloud.zone_starts, "dense": cloud.dense, "zone": local.zone,
-              "transfer": local.transfer}
+    if isinstance(cloud, LitSurfaces):
+        arrays = {"corners": cloud.corners, "patch": cloud.patch, "axes": cloud.axes}
+        known = {}
+    else:
+        arrays = {"positions": cloud.positions, "zone_starts": cloud.zone_starts, "dense": cloud.dense}
+        known = {"emission_order": cloud.emission_order, "spacing": cloud.spacing, "radius": cloud.radius}
+    arrays |= {"zone": local.zone, "transfer": local.transfer}
     if local.probes is not None:
         arrays |= {"probe_positions": local.probes.positions, "probe_responses": local.probes.responses}
     if local.rows is not None:
         arrays |= {"points": local.points, "rows": local.rows}
-    return arrays, {"facts": local.facts, "emission_order": cloud.emission_order, "spacing": cloud.spacing,
-                    "radius": cloud.radius}
+    return arrays, {"facts": local.facts, **known}
 
 
 def unpacked_local(arrays: dict[str, NDArray], header: dict[str, Any]) -> LocalTransfer:
     """A finished stage."""
-    cloud = LightCloud(arrays["positions"], arrays["zone_starts"], header["emission_order"], arrays["dense"],
-                       header["spacing"], header["radius"])
+    cloud: LocalBasis
+    if "axes" in arrays:
+        cloud = LitSurfaces(arrays["corners"], arrays["patch"], arrays["axes"])
+    else:
+        cloud = LightCloud(arrays["positions"], arrays["zone_starts"], header["emission_order"], arrays["dense"],
+                           header["spacing"], header["radius"])
     probes = Probes(arrays["probe_positions"], arrays["probe_responses"]) if "probe_positions" in arrays else None
     return LocalTransfer(cloud, arrays["zone"], arrays["transfer"], header["facts"], arrays.get("points"),
                          arrays.get("rows"), probes)
@@ -186,7 +212,7 @@ def _placed(tracer: Tracer, scene: SceneMesh, regions: NDArray[np.float64], sett
 
 def _facts(lights: PlacedLights, cloud: LightCloud, settings: BakeSettings) -> dict[str, Any]:
     """What the report tells."""
-    return {"lights": len(lights), "spacing": float(lights.spacing), "inside_bodies": lights.inside,
+    return {"basis": "cloud", "lights": len(lights), "spacing": float(lights.spacing), "inside_bodies": lights.inside,
             "near_surfaces": lights.near, "emission_order": cloud.emission_order, "zones": cloud.zones,
             "merged": [int(n) for n in np.diff(cloud.zone_starts)], "columns": cloud.columns,
             "merged_response": settings.merged_response, "warnings": list(lights.warnings)}
@@ -250,13 +276,13 @@ def _solve_again(solver: LightSolver, cloud: LightCloud, missing: list[tuple[int
     yield from solver.solve(places, take)
 
 
-def _probes(solver: LightSolver, cloud: LightCloud, gathered: Gather, points: int, seed: int,
+def _probes(solver: LightSolver, lights: PlacedLights, gathered: Gather, points: int, order: int, seed: int,
             ) -> Generator[float, None, Probes]:
-    """Solutions at places between the cloud's lights."""
-    positions = probe_positions(solver.tracer, cloud, seed)
+    """Solutions at places between the cloud's lights. order: of the solver's emission."""
+    positions = probe_positions(solver.tracer, lights.positions, lights.spacing, seed)
     responses = np.zeros((points, len(positions), solver.albedo.shape[1]), np.float32)
     front = gathered.receivers.key < points
-    step = cloud.emission_order ** 2
+    step = order ** 2
 
     def take(part: slice, response: NDArray[np.float32]) -> None:
         responses[gathered.receivers.key[front], part] = response[front][:, ::step]

@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh
+from ..transport.incident_light import NUMBERS
 from ..transport.interreflection import SLOW_RATIO
+from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .settings import BakeSettings
+from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
 # Orders of magnitude measured on two cores (benchmarks/tracing.py); used for the forecast and the progress bar only,
@@ -23,6 +27,9 @@ SECONDS_PER_BOUNCED_VALUE = 2e-8
 SECONDS_PER_ENCODED_VALUE = 1.2e-8
 SECONDS_PER_GLOSSY_VALUE = 1e-7
 SECONDS_PER_LOCAL_VALUE = 2e-7
+# Of highlights of local light, for each value of their rows: filled, and encoded (many more values for each receiver
+# than diffuse light has, and the encoder first looks for their leading axes).
+SECONDS_PER_LOCAL_ROW, SECONDS_PER_WIDE_VALUE = 1.4e-7, 1e-6
 SECONDS_PER_SUBSURFACE_VALUE = 2e-6
 # Memory, fitted to the peaks of stages of bakes of 3,000 to 41,000 receivers, diffuse and metal, draft to high: it is
 # 1.2 to 1.8 times what they took; PROCESS, the interpreter and its libraries, is half of that here, more in Blender.
@@ -35,8 +42,11 @@ BYTES_PER_RAY_HIT, BYTES_PER_KEPT_HIT, BYTES_PER_SORTED_HIT = 24, 30, 75
 COPIES_OF_SERIES, COPIES_OF_KRYLOV, BYTES_PER_BASE_VALUE = 5, 24, 20
 # The encoder's rows at once, how often they are held, and the most axes that it looks for (see global_frame.py).
 ENCODED_ROWS, COPIES_OF_ROWS, MOST_AXES = 4096, 4, 1024
-# Local lights: solved at once, and the share that is left of them after merging.
-LIGHTS_AT_ONCE, TYPICAL_MERGED_SHARE = 32, 0.5
+# Local lights: the share that is left of them after merging; of what is solved at once, copies of one channel; of
+# blocks of what highlights see of it, the largest temporary array, of which each thread has a few.
+TYPICAL_MERGED_SHARE, LEAST_MERGED_SHARE, COPIES_OF_SOLVED, COPIES_OF_BLOCK = 0.5, 0.2, 6, 3
+# How much more the forecast of memory may say than what is taken.
+MOST_OVERRATED = 2.0
 # Smaller clusters cost more in bases, and in constants at each light change, than their points save.
 RECEIVERS_PER_CLUSTER = 24
 # Of matrices (highlights): receivers for each one in a basis, so that what is stored shrinks to half at most, and bytes
@@ -58,6 +68,7 @@ class Plan:
     seconds: dict[str, float]
     rays: dict[str, int]
     peak_bytes: int
+    least_bytes: int
     stored_bytes: int
     disk_bytes: int
 
@@ -84,37 +95,63 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     seconds["direct"] = rays["direct"] / SHADOW_RAYS_PER_SECOND + 1e-8 * values
     if needs.bounces:
         seconds["interreflection"] = values * settings.gather_directions * 0.02 * SECONDS_PER_BOUNCED_VALUE + 0.05
-    if glossy:
+    if glossy and settings.distant_light:
         rows = len(surfaces.functions) * columns * needs.channels * glossy
         seconds["glossy"] = 0.1 + rows * SECONDS_PER_GLOSSY_VALUE
         values += rows
+    wide = 0
     if settings.local_light:
-        local = receivers * settings.cloud_lights * max(settings.cloud_emission, 1) ** 2
-        rays["local"] = receivers * settings.cloud_lights if needs.bounces else 0
+        local = receivers * _local_solutions(settings)
+        rays["local"] = _local_rays(scene, settings, receivers) if needs.bounces else 0
         seconds["local"] = 0.2 + rays["local"] / SHADOW_RAYS_PER_SECOND + local * SECONDS_PER_LOCAL_VALUE
+        wide = receivers * _local_columns(settings) * needs.channels
+        if glossy and needs.bounces:  # solved once more, and seen by each of them
+            wide += glossy * len(surfaces.functions) * _local_columns(settings) * needs.channels
+            seconds["local"] = 2.0 * seconds["local"] + wide * SECONDS_PER_LOCAL_ROW
     if translucent:
         seconds["subsurface"] = 0.2 + translucent * columns * needs.channels * SECONDS_PER_SUBSURFACE_VALUE
-    seconds["encode"] = 0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
+    seconds["encode"] = (0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
+                         + wide * SECONDS_PER_WIDE_VALUE)
     if settings.error_receivers:
         # Diffuse light and highlights are measured apart, each with paths of about two rays.
         rays["errors"] = (4 if glossy else 2) * settings.error_receivers * settings.error_paths
         seconds["errors"] = 0.1 + rays["errors"] / PATH_RAYS_PER_SECOND
     peak, disk = _memory(scene, settings, needs, surfaces, receivers)
-    return Plan(needs, surfaces, receivers, seconds, rays, peak, _stored(scene, settings, needs, surfaces), disk)
+    least = int(_memory(scene, settings, needs, surfaces, receivers, LEAST_MERGED_SHARE)[0] / MOST_OVERRATED)
+    stored = _stored(scene, settings, needs, surfaces)
+    return Plan(needs, surfaces, receivers, seconds, rays, peak, least, stored, disk)
+
+
+def _local_solutions(settings: BakeSettings) -> int:
+    """Fields of local light that the operator carries at most."""
+    if settings.lamp_basis == "surfaces":
+        return settings.surface_patches
+    return settings.cloud_lights * max(1, settings.cloud_emission) ** 2
+
+
+def _local_rays(scene: SceneMesh, settings: BakeSettings, receivers: int) -> int:
+    """Shadow rays to the lights of a cloud, or to the lamps that lit surfaces are learnt from."""
+    if settings.lamp_basis == "surfaces":
+        lamps = settings.cloud_lights * (1.0 + NEAR_SURFACES + OUTSIDE)
+        return int(lamps * min(MOST_ELEMENTS, len(scene.triangles)))
+    return receivers * settings.cloud_lights
 
 
 def _local_columns(settings: BakeSettings, share: float = TYPICAL_MERGED_SHARE) -> int:
-    """Columns of local lights, if a share of them is left after merging."""
+    """Columns of local lights, if a share of them is left after merging; all functions of a spot's emission count."""
     if not settings.local_light:
         return 0
+    if settings.lamp_basis == "surfaces":
+        return settings.surface_columns
     kept = 1.0 if settings.merge_response == 0.0 or settings.merge_distance == 0.0 else share
     return math.ceil(kept * settings.cloud_lights) * max(1, settings.cloud_emission) ** 2
 
 
 def _shapes(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan,
-            ) -> list[tuple[int, tuple[int, int, int]]]:
-    """Of each target, its receivers and the shape of their matrices (rows, columns, channels)."""
-    columns = (needs.order ** 2 if settings.distant_light else 0) + _local_columns(settings)
+            share: float = TYPICAL_MERGED_SHARE) -> list[tuple[int, tuple[int, int, int]]]:
+    """Of each target, its receivers and the shape of their matrices (rows, columns, channels). share: of lights that
+    is left after merging."""
+    columns = (needs.order ** 2 if settings.distant_light else 0) + _local_columns(settings, share)
     return [(int((~scene.loose[o.points]).sum()),
              (1 + len(surfaces.functions_of_object(scene, o)), columns, needs.channels))
             for o in scene.objects if o.is_target]
@@ -129,8 +166,9 @@ def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
 
 
 def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan, receivers: int,
-            ) -> tuple[int, int]:
-    """Bytes at the peak of the largest stage, and on disk at the end of the last one."""
+            share: float = 1.0) -> tuple[int, int]:
+    """Bytes at the peak of the largest stage, and on disk at the end of the last one. share: of lights that is left
+    after merging, which nobody knows before."""
     glossy = int(surfaces.glossy_points(scene).sum())
     hits_each = settings.gather_directions / 2 * TYPICAL_HIT_SHARE if needs.bounces else 0.0
     operator, kept = receivers * hits_each * BYTES_PER_RAY_HIT, glossy * hits_each * BYTES_PER_KEPT_HIT
@@ -141,21 +179,52 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
     # A series of bounces is slow only where surfaces send back more than its ratio.
     slow = float(surfaces.bounce_albedo(scene).max(initial=0.0)) > SLOW_RATIO
     copies, second = (COPIES_OF_KRYLOV, 1.5 * operator) if slow else (COPIES_OF_SERIES, 0.5 * operator)
+    if not settings.distant_light:
+        rows = 0
+    local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions), share)
+    shapes = _shapes(scene, settings, needs, surfaces, share)
     stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
               known + second + copies * transfer,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
-              _encoding(settings, _shapes(scene, settings, needs, surfaces), rows, transfer)]
-    responses = merged = 0
-    if settings.local_light:
-        emitted = max(1, settings.cloud_emission) ** 2 * needs.channels
-        responses = 4 * receivers * settings.cloud_lights * emitted if needs.bounces else 0
-        merged = 4 * receivers * _local_columns(settings) * needs.channels
-        zone = responses * min(1.0, (settings.zone_receivers or receivers) / max(1, receivers))
-        at_once = min(LIGHTS_AT_ONCE, settings.cloud_lights)
-        solving = second + copies * 4 * receivers * at_once * emitted if needs.bounces else 0.0
-        stages.append(known + transfer + rows + merged + max(2 * zone, solving))
-    disk = operator + kept + visibility + 2 * transfer + rows + merged + responses
+              known + transfer + rows + local.kept + max(local.zone, second + local.solving),
+              _encoding(settings, shapes, rows + local.kept, transfer)]
+    disk = operator + kept + visibility + 2 * transfer + rows + local.kept + local.responses
     return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + max(stages)), int(disk)
+
+
+@dataclass(frozen=True)
+class _LocalMemory:
+    """Bytes of local lights: kept, of their transfer and highlights; responses, on disk; zone, while one of them merges
+    its lights; solving, while some lights are solved and seen by highlights."""
+
+    kept: float = 0.0
+    responses: float = 0.0
+    zone: float = 0.0
+    solving: float = 0.0
+
+
+def _local_memory(settings: BakeSettings, needs: Needs, receivers: int, glossy: int, functions: int,
+                  share: float) -> _LocalMemory:
+    """What local lights take. share: of them that is left after merging."""
+    if not settings.local_light:
+        return _LocalMemory()
+    columns, channels = _local_columns(settings, share), needs.channels
+    if not needs.bounces:
+        return _LocalMemory(4 * receivers)
+    kept = 4 * receivers * columns * channels + 4 * glossy * functions * columns * channels
+    responses = 4 * receivers * _local_solutions(settings) * channels
+    in_zone = min(1.0, (settings.zone_receivers or receivers) / max(1, receivers))
+    at_once = min(COLUMNS, columns)
+    solving = 4 * receivers * at_once * (channels + COPIES_OF_SOLVED)
+    if glossy:
+        seen = min(NUMBERS, glossy * INCIDENT_ORDER ** 2 * at_once * channels)
+        threads = settings.threads or os.cpu_count() or 1
+        solving += 4 * (receivers + in_zone * glossy * functions) * at_once * channels \
+            + 4 * COPIES_OF_BLOCK * threads * seen
+    if settings.lamp_basis == "surfaces":  # the lamps' light at all receivers, and once more of equal weight
+        learnt = 8 * receivers * channels * 2 * settings.cloud_lights * (1.0 + NEAR_SURFACES + OUTSIDE)
+        return _LocalMemory(kept, responses, learnt, solving + 0.5 * learnt)
+    return _LocalMemory(kept, responses, 2 * responses * in_zone, solving)
 
 
 def _encoding(settings: BakeSettings, shapes: list[tuple[int, tuple[int, int, int]]], rows: int,

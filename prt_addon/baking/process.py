@@ -20,6 +20,7 @@ from typing import IO, Any
 import scipy
 
 from ..errors import Cancelled, PRTError
+from .leftovers import drop_unfinished
 
 Message = dict[str, Any]
 
@@ -120,6 +121,7 @@ class BakeProcess:
             self.process.wait()
         if self.process.stdin is not None:
             self.process.stdin.close()  # only now: its end tells a living child that the parent died
+        drop_unfinished(self.job)
 
     def _new_messages(self) -> Iterator[Message]:
         with open(self.job / MESSAGE_FILE, "rb") as file:
@@ -146,7 +148,7 @@ class BakeProcess:
             cause = f"the bake process ended with status {code}" + (f" ({last})" if last else "")
         if code == -9:
             cause += ", most often because memory ran out"
-            remedy = "Choose a lower order, fewer directions or fewer objects and bake again to resume"
+            remedy = "Choose a lower order, fewer directions, lights or objects and bake again to resume"
         else:
             remedy = "The previous bake is untouched; bake again to resume"
         return error_message(PRTError("Bake", cause, remedy))

@@ -49,10 +49,21 @@ from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
+from .lit_highlights import LitHighlights
 from .local_budget import local_budget
-from .local_lights import LitHighlights, LocalTransfer, local_transfer, packed_local, unpacked_local
+from .local_highlight_budget import local_highlight_budget
+from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
+from .memory import memory_warning
 from .plan import Plan, make_plan, most_clusters
-from .results import LocalColumns, object_container, report_of, stability_of, surface_checks, white_world_checks
+from .results import (
+    LocalColumns,
+    lamps_covered,
+    object_container,
+    report_of,
+    stability_of,
+    surface_checks,
+    white_world_checks,
+)
 from .settings import BakeSettings
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
@@ -130,6 +141,7 @@ class _Bake:
     local_scale: float = 1.0
     local_sample: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
     local_errors: dict[str, Any] = field(default_factory=dict)
+    local_highlight_errors: dict[str, Any] = field(default_factory=dict)
 
     def run(self) -> Generator[Progress, None, BakeResult]:
         """All stages in order."""
@@ -137,6 +149,7 @@ class _Bake:
         self.rays_resumed = 0
         self.tracer: Tracer | None = None
         self.plan: Plan = make_plan(self.scene, self.settings, self.light)
+        self.memory_warning = memory_warning(self.plan, self.settings)
         self.timer = StageTimer(lambda: self.tracer.rays if self.tracer else 0)
         self.stage_order = list(self.plan.seconds)
         with self.timer.stage("prepare"):
@@ -177,6 +190,8 @@ class _Bake:
             self._find_buried(transfer)
             signals = self._signals(transfer, glossy, subsurface)
             self._join_local(signals, local)
+            self._choose_local_highlights(local, signals)
+            local = None
             self._choose_highlights(glossy, signals)
             glossy = None
             self._fill_buried(signals)
@@ -189,6 +204,7 @@ class _Bake:
                     errors = yield from self._errors(transfer, encodings)
                     highlights = yield from self._highlight_errors(encodings)
                 self.local_errors = yield from self._local_errors(encodings)
+                self.local_highlight_errors = yield from self._local_highlight_errors(encodings)
         return self._result(gathered, bounced, transfer, encodings, (errors, highlights), subsurface)
 
     def _progress(self, stage: str, fraction: float) -> Progress:
@@ -532,6 +548,20 @@ class _Bake:
                                      if signals[t.name].shape[1] == 1 + glossy.rows.shape[1]])
             self.highlights = keys, glossy.at(keys), before
 
+    def _choose_local_highlights(self, local: LocalTransfer | None, signals: dict[str, NDArray[np.float32]]) -> None:
+        """The same of highlights under lamps, from the columns of the light cloud."""
+        self.local_highlights: tuple[NDArray, ...] | None = None
+        if local is None or local.rows is None or local.probes is None:
+            return
+        keys = choose_receivers(self.open_keys[self.glossy[self.open_keys]], self.settings.error_receivers,
+                                self.settings.seed)
+        if len(keys):
+            functions, columns = local.rows.shape[1:3]
+            before = np.concatenate([signals[t.name][keys[(keys >= t.points.start) & (keys < t.points.stop)]
+                                                     - t.points.start, 1:, -columns:] for t in self.targets
+                                     if signals[t.name].shape[1] == 1 + functions])
+            self.local_highlights = keys, GlossyRows(local.points, local.rows).at(keys), before
+
     def _encode(self, signals: dict[str, NDArray[np.float32]]) -> Generator[Progress, None, dict[str, Encoding]]:
         """Each target's encoding; a thread encodes while this one reports, so that a bake can be cancelled."""
         encodings: dict[str, Encoding] = {}
@@ -633,7 +663,22 @@ class _Bake:
         compressed /= self.local_scale * np.maximum(share, LEAST_DIFFUSE)[:, None, None]
         return (yield from self._follow("errors", local_budget(
             self.tracer, self.scene, self.albedo, keys, self.local.cloud, self.local.zone[keys], self.local.probes,
-            before, compressed, settings.bounces, settings.error_paths, settings.seed)))
+            before, compressed, settings.bounces, settings.error_paths, settings.seed, *self._objects_of(keys))))
+
+    def _local_highlight_errors(self, encodings: dict[str, Encoding]) -> Generator[Progress, None, dict[str, Any]]:
+        """The error budget of what highlights show of lamps' bounced light."""
+        if self.local_highlights is None or not len(self.local.probes.positions):
+            return {}
+        settings, (keys, rows, before) = self.settings, self.local_highlights
+        rows = np.broadcast_to(rows, before.shape).astype(np.float64)
+        columns = before.shape[2]
+        decoded_rows = self._compressed(keys, encodings, slice(1, None), before.shape[1:], slice(-columns, None))
+        compressed = rows + (decoded_rows - before) / self.local_scale
+        surfaces = TrueSurfaces.of(self.tracer, self.scene, self.surfaces, self.albedo)
+        sample = HighlightSample(keys, rows, compressed, self.surfaces.functions, *self._objects_of(keys))
+        return (yield from self._follow("errors", local_highlight_budget(
+            surfaces, sample, self.local.cloud, self.local.zone[keys], self.local.probes.positions, settings.bounces,
+            settings.error_paths, settings.seed)))
 
     def _objects_of(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
         """The number of each receiver's target, and the targets' names."""
@@ -643,8 +688,9 @@ class _Bake:
         return numbers, tuple(target.name for target in self.targets)
 
     def _compressed(self, keys: NDArray[np.int64], encodings: dict[str, Encoding], rows: slice,
-                    shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Some decoded rows (k, rows, columns, channels) of the receivers `keys`; shape: without k."""
+                    shape: tuple[int, ...], columns: slice | None = None) -> NDArray[np.float64]:
+        """Some decoded rows (k, rows, columns, channels) of the receivers `keys`; shape: without k; columns: None for
+        the first ones, those of distant light."""
         result = np.zeros((len(keys), *shape))
         for target in self.targets:
             inside = np.flatnonzero((keys >= target.points.start) & (keys < target.points.stop))
@@ -652,7 +698,7 @@ class _Bake:
                 place = np.cumsum(~self.scene.loose[target.points]) - 1
                 values = decoded(encodings[target.name], place[keys[inside] - target.points.start])
                 values = values.reshape(len(inside), *self.shapes[target.name])
-                result[inside] = values[:, rows, :shape[1]]  # without the columns of local lights
+                result[inside] = values[:, rows, slice(shape[1]) if columns is None else columns]
         return result
 
     def _result(self, gathered: Gather | None, bounced: Interreflection | None, transfer: NDArray[np.float32],
@@ -669,10 +715,15 @@ class _Bake:
         if self.local is not None:
             report["local"] = self.local.facts
             report["local_errors"] = self.local_errors
+            report["local_highlight_errors"] = self.local_highlight_errors
             if not self.settings.distant_light:
                 report["errors"], report["local_errors"] = self.local_errors, {}
             report["headline"] = headline(report)
+            if self.local_errors:
+                report["covers"] += lamps_covered(self.local_highlight_errors)
             report["scene"]["warnings"] += self.local.facts["warnings"]
+        if self.memory_warning:
+            report["scene"]["warnings"].append(f"Bake: {self.memory_warning}")
         if self.filled:
             note = (f"{plural(self.filled, 'receiver', 'receivers')} inside other objects"
                     f" {'takes its' if self.filled == 1 else 'take their'} neighbours' light")

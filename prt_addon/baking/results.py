@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..basis.hemisphere import Indices, hemisphere_basis
 from ..compression.coherence import Coherence, overdraw
 from ..compression.encoding import Encoding
-from ..lighting.light_cloud import LightCloud
+from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import remove_ringing
 from ..reporting.headline import PARTS, headline, object_errors
@@ -20,7 +20,7 @@ from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
-from ..storage.columns import Columns, columns_entry
+from ..storage.columns import Columns, columns_entry, surfaces_entry
 from ..storage.container import CONSTANT_ROWS, BakedTransfer, hemisphere_rows, make_header
 from ..storage.digests import digest_json
 from ..transport.gather import Gather
@@ -71,6 +71,9 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
         settings=settings.as_dict(),
         errors={name: entry["relative_rms"] for name, entry in report["errors"].items()},
         highlight_errors={name: entry["relative_rms"] for name, entry in report["highlight_errors"].items()},
+        local_errors={name: entry["relative_rms"] for name, entry in (report.get("local_errors") or {}).items()},
+        local_highlight_errors={name: entry["relative_rms"]
+                                for name, entry in (report.get("local_highlight_errors") or {}).items()},
         own_errors={part: errors[target.name] for part in PARTS
                     if target.name in (errors := object_errors(report, part))},
         coherence=report["clusters"]["objects"][target.name].get("coherence"),
@@ -87,10 +90,10 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
 
 @dataclass(frozen=True)
 class LocalColumns:
-    """cloud: whose lights the last columns belong to; cluster_zone: (clusters,) int32; scale: factor that these columns
-    were encoded with."""
+    """cloud: whose lights, or what surfaces, the last columns belong to; cluster_zone: (clusters,) int32; scale: factor
+    that these columns were encoded with."""
 
-    cloud: LightCloud
+    cloud: LocalBasis
     cluster_zone: NDArray[np.int32]
     scale: float
 
@@ -98,6 +101,8 @@ class LocalColumns:
         """`columns` of a header, for so many in all."""
         cloud = self.cloud
         basis = Columns(round((columns - cloud.columns) ** 0.5), cloud.columns)
+        if isinstance(cloud, LitSurfaces):
+            return surfaces_entry(basis, len(cloud.corners), cloud.axes.shape[1], len(self.cluster_zone))
         return columns_entry(basis, cloud.emission_order, float(cloud.spacing), float(cloud.radius),
                              tuple(np.diff(cloud.zone_starts)), tuple(self.cluster_zone))
 
@@ -227,6 +232,16 @@ def _covers(scene: SceneMesh, plan: Plan, measured: dict[str, Any]) -> list[str]
     if any(part.kernel is None and part.highlight.max() > 0.0 for part in used):
         found.append("Highlights that were left out are not part of it; what was left out says how much light they "
                      "return")
+    return found
+
+
+def lamps_covered(highlight_errors: dict[str, Any]) -> list[str]:
+    """The same for a bake with local lights. highlight_errors: of highlights under lamps, empty if not measured."""
+    found = ["Lamps: light that bounced, of a point lamp at places in the open, clear of surfaces. Its direct "
+             "light is not baked but found exactly, but for the steps of soft shadows"]
+    if highlight_errors:
+        found.append("Highlights under lamps: what they show of surfaces that the lamp shines on; the lamp's own "
+                     "highlight is measured apart from the total")
     return found
 
 

@@ -12,6 +12,7 @@ from ..errors import BadArguments
 HIGHEST_ORDER = 10
 GLOSSY_ROWS = (0, 4, 9, 16, 24, 25)
 LIGHTINGS = ("environment", "local", "environment,local")
+LAMP_BASES = ("surfaces", "cloud")
 MERGED_RESPONSES = ("arithmetic", "harmonic", "solution")
 MOST_CLOUD_LIGHTS = 4096
 
@@ -42,10 +43,16 @@ class BakeSettings:
     subsurface: whether light travels through translucent materials.
     fit_order_to_light: lower the order to what the scene's present light carries.
     lighting: "environment" (World and Suns), "local" (lamps that move within a light cloud), or both with a comma.
+    lamp_basis: what the columns of lamps stand for. "surfaces": the surfaces that lamps shine on, found by shadow rays
+        when relighting; right for lamps of all kinds at any place. "cloud": lights of a cloud, between which a lamp is
+        interpolated (Kristensen 2005).
+    surface_patches: most patches that surfaces are divided into. surface_columns: most columns: ways in which the light
+        of lamps can differ after a bounce.
     cloud_region: name of a box empty, of a mesh that bounds a region, or of a collection of these, in which local
         lights will move; "" = the scene's free space.
     cloud_lights: most lights of the dense cloud (Kristensen 2005, section 4); each is one more global illumination
-        solution. cloud_spacing: metres between them instead; 0 = as cloud_lights allow.
+        solution. Of surfaces: places in the open from which their columns are learnt. cloud_spacing: metres between
+        them instead; 0 = as cloud_lights allow.
     cloud_emission: order of the spherical harmonics of a light's directional emission, for spots and area lights
         (columns grow with its square); 0 = 1 where the scene has only Point lights, else 2.
     cloud_radius: metres; lights are diffuse spheres of this radius; 0 = points.
@@ -79,6 +86,9 @@ class BakeSettings:
     subsurface: bool = True
     fit_order_to_light: bool = False
     lighting: str = "environment"
+    lamp_basis: str = "surfaces"
+    surface_patches: int = 2048
+    surface_columns: int = 384
     cloud_region: str = ""
     cloud_lights: int = 216
     cloud_spacing: float = 0.0
@@ -108,11 +118,13 @@ class BakeSettings:
 
 PRESETS: dict[str, BakeSettings] = {
     "draft": BakeSettings(order=4, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
-                          cloud_lights=64, encoder="static", compression_error=1e-2, spacing=1.0 / 32.0,
+                          surface_patches=1024, surface_columns=128, cloud_lights=64, encoder="static",
+                          compression_error=1e-2, spacing=1.0 / 32.0,
                           error_receivers=32, error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
     "standard": BakeSettings(),
     "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
-                         cloud_lights=512, merge_response=0.02, encoder="adaptive", compression_error=5e-4,
+                         surface_patches=4096, surface_columns=512, cloud_lights=512, merge_response=0.02,
+                         encoder="adaptive", compression_error=5e-4,
                          spacing=1.0 / 128.0, error_receivers=128, error_paths=16384, glossy_rows=24,
                          glossy_albedo=0.03),
 }
@@ -134,6 +146,8 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "error_paths": (64, 2 ** 20, "fewer say nothing"),
     "glossy_rows": (0, 25, "order 5 of the hemisphere"),
     "glossy_albedo": (0.0, 1.0, "it is a share of the light"),
+    "surface_patches": (1, 2 ** 14, "each is one more solution"),
+    "surface_columns": (1, 1024, "each is carried by every cluster"),
     "cloud_lights": (1, MOST_CLOUD_LIGHTS, "each is a global illumination solution"),
     "cloud_spacing": (0.0, 1e9, "0 means as cloud_lights allow"),
     "cloud_emission": (0, 4, "columns grow with its square"),
@@ -191,7 +205,7 @@ def check(settings: BakeSettings) -> BakeSettings:
     if settings.glossy_rows not in GLOSSY_ROWS:
         raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
                            f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
-    for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES)):
+    for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES), ("lamp_basis", LAMP_BASES)):
         if getattr(settings, name) not in words:
             raise BadArguments(f"setting {name}", f"{getattr(settings, name)!r} is unknown",
                                f"Use one of {' or '.join(words)}")

@@ -17,6 +17,7 @@ import site
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -45,8 +46,9 @@ def emit(message_type: str, **values: Any) -> None:
     sys.stdout.flush()
 
 
-def die_with_parent() -> None:
+def die_with_parent(clean_up: Callable[[], None]) -> None:
     """End at once when the parent closes our input or dies: finished stages are on disk, so nothing is lost.
+    clean_up: removes what is unfinished, as no parent is left to do it.
 
     Its own thread, because the main thread may be inside a long call. It reads the bare descriptor: the lock of a
     buffered sys.stdin held at the interpreter's end aborts the process.
@@ -55,7 +57,10 @@ def die_with_parent() -> None:
     def watch() -> None:
         while os.read(0, 1):
             pass
-        os._exit(3)
+        try:
+            clean_up()
+        finally:
+            os._exit(3)
 
     threading.Thread(target=watch, daemon=True, name="parent watch").start()
 
@@ -84,7 +89,7 @@ def run(job_folder: Path) -> int:
         return error.exit_code
     except MemoryError:
         emit("error", subject="Bake", cause="memory ran out",
-             remedy="Choose a lower order, fewer directions or fewer objects and bake again to resume", exit_code=1)
+             remedy="Choose a lower order, fewer directions, lights or objects and bake again to resume", exit_code=1)
         return 1
     emit("done")
     return 0
@@ -97,8 +102,9 @@ def main() -> int:
     arguments = parser.parse_args()
     site.addsitedir(arguments.site)
     be_polite()
-    die_with_parent()
     load_package(PACKAGE_FOLDER)
+    leftovers = importlib.import_module(f"{PACKAGE_FOLDER.name}.baking.leftovers")
+    die_with_parent(lambda: leftovers.drop_unfinished(arguments.job))
     return run(arguments.job)
 
 

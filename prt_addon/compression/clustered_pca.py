@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .global_frame import GlobalFrame
 from .monitor import Monitor
-from .neighbours import Neighbours, Sweep, nearest_of_all, reclassify_all, reclassify_near
+from .neighbours import Neighbours, Sweep, nearest_of_all, reclassify_near
 from .rebalancing import exchange, rebalance
 from .reclassify import reclassify
 from .seeding import split_seeds
@@ -24,7 +24,7 @@ from .vector_quantization import lbg, random_means
 from .workers import Workers
 
 # Energy that the values left out may hold, relative to the current squared error.
-TRUNCATION = 0.1
+TRUNCATION = 0.2
 # The same while splitting, whose clusters are only a start.
 SEED_TRUNCATION = 0.3
 # Vectors with which the first splits are judged.
@@ -45,10 +45,12 @@ EXACT = 2.0
 ROUNDS = 2
 # Share of the points that a survey must have moved beyond their neighbours for the next one, the first with a number of
 # vectors or another with as many, to be worth its time.
-WORTH_THE_FIRST, WORTH_ANOTHER = 0.001, 0.005
+WORTH_THE_FIRST, WORTH_ANOTHER = 0.003, 0.005
+# Share of the squared error held by the points that a survey tries with all subspaces.
+SURVEYED = 0.6
 # Of wide signals: sweeps for each number of vectors but the last LAST, and for those, where they help most; after how
 # many the first and the next ones look at all subspaces; LBG iterations before all.
-FIRST_SWEEPS, LAST_SWEEPS, LAST, SURVEY, SURVEY_EVERY, LBG_ITERATIONS = 3, 6, 3, 1, 3, 6
+FIRST_SWEEPS, LAST_SWEEPS, LAST, SURVEY, SURVEY_EVERY, LBG_ITERATIONS = 3, 10, 1, 1, 3, 6
 
 
 @dataclass
@@ -74,17 +76,14 @@ class Work:
         return update(self.frame.coordinates[:, :width], state, self.monitor.workers) + float(self.frame.tail[width])
 
     def sweep(self, state: Subspaces, error: float, survey: bool = False) -> tuple[Sweep, float]:
-        """One classification among neighbours (survey: among all) and one update, on as many values as the error asks
-        for."""
+        """One classification among neighbours (survey: of the worst points among all) and one update, on as many values
+        as the error asks for."""
         width = state.means.shape[1]
         data, before = self.frame.coordinates[:, :width], state.labels
+        sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers,
+                                SURVEYED if survey else 0.0)
         if survey:
-            listed = np.zeros((len(state.means),) * 2, bool)
-            np.put_along_axis(listed, self.neighbours.lists(state), True, axis=1)
-            sweep = reclassify_all(data, state, self.monitor.workers)
-            self.unseen = float(np.mean(~listed[before, state.labels]))
-        else:
-            sweep = reclassify_near(data, state, self.neighbours.lists(state), self.monitor.workers)
+            self.unseen = sweep.unseen
         self.neighbours.learn(before, state.labels, sweep.runner_up)
         return sweep, self.fit(state, max(width, self.frame.leading(TRUNCATION * error)))
 

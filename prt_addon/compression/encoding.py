@@ -17,7 +17,7 @@ from .global_frame import GlobalFrame, global_frame
 from .monitor import Monitor, Progress
 from .pca import principal_components
 from .settings import EncoderSettings
-from .subspaces import Subspaces
+from .subspaces import Subspaces, from_labels
 from .workers import Workers
 
 # Squared error relative to the signal's energy that single precision cannot lower: nothing is spent below it.
@@ -89,10 +89,10 @@ def encode(signal: NDArray[np.floating], settings: EncoderSettings, metric: NDAr
     with Workers(settings.threads, monitor.tick) as monitor.workers:
         frame = global_frame(signal, metric, monitor.workers, unseen)
         monitor.unit = frame.scale**2
-        labels, vectors, left_out = _classify(frame, settings, monitor)
+        state, left_out = _classify(frame, settings, monitor)
         monitor.span(0.95, 1.0)
         enough = _enough(frame, settings) if settings.target_error is not None else None
-        result = _finish(frame, labels, vectors, enough, monitor.workers)
+        result = _finish(frame, state, enough, monitor.workers)
     monitor.note("done", float(result.discarded.sum()) / monitor.unit, 1.0)
     return replace(result, history=tuple(monitor.history), adaptive_left_out=left_out)
 
@@ -113,21 +113,27 @@ def _enough(frame: GlobalFrame, settings: EncoderSettings) -> float:
     return max(settings.target_error or 0.0, ROUNDING) * frame.energy
 
 
-def _classify(frame: GlobalFrame, settings: EncoderSettings,
-              monitor: Monitor) -> tuple[NDArray[np.int32], NDArray[np.int64], bool]:
-    """Every point's cluster, every cluster's number of vectors, and whether the adaptive pass was left out."""
+def _classify(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -> tuple[Subspaces, bool]:
+    """Every point's cluster, every cluster's number of vectors, perhaps subspaces near the best; and whether the
+    adaptive pass was left out."""
     if settings.clusters == 1 or frame.tail[0] <= ROUNDING * frame.energy:
-        return np.zeros(len(frame.coordinates), np.int32), np.array([settings.vectors]), False
+        return _unfitted(np.zeros(len(frame.coordinates), np.int32), settings), False
     if settings.method == "static":
-        labels = static_labels(frame, settings, monitor)
-        return labels, np.full(int(labels.max()) + 1, settings.vectors), False
+        return _unfitted(static_labels(frame, settings, monitor), settings), False
     share = 0.6 if settings.method == "adaptive" else 0.95
     state = _best_start(frame, settings, _enough(frame, settings), monitor, share)
     left_out = False
     if settings.method == "adaptive":
         monitor.span(share, 0.95)
         left_out = not adapt(frame, state, settings, monitor)
-    return state.labels, state.vectors, left_out
+    return state, left_out
+
+
+def _unfitted(labels: NDArray[np.int32], settings: EncoderSettings) -> Subspaces:
+    """A classification alone."""
+    state = from_labels(labels, int(labels.max()) + 1, 0, settings.vectors)
+    state.bases = state.bases[:, :0]
+    return state
 
 
 def _best_start(frame: GlobalFrame, settings: EncoderSettings, enough: float, monitor: Monitor,
@@ -170,18 +176,18 @@ def _is_wide(frame: GlobalFrame) -> bool:
     return frame.coordinates.shape[1] >= WIDE_VALUES
 
 
-def _finish(frame: GlobalFrame, labels: NDArray[np.int32], vectors: NDArray[np.int64],
-            enough: float | None, workers: Workers) -> Encoding:
+def _finish(frame: GlobalFrame, state: Subspaces, enough: float | None, workers: Workers) -> Encoding:
     """Exact PCA of every cluster on all values, then back to the signal's own values.
 
     enough: squared error up to which the least useful vectors are left out again; None keeps all.
     """
-    used, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    used, labels, counts = np.unique(state.labels, return_inverse=True, return_counts=True)
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(counts)[:-1])
+    vectors = state.vectors
     fits = []
     for cluster, points in zip(used, members, strict=True):
         workers.tick()
-        fits.append(principal_components(frame.coordinates[points], int(vectors[cluster])))
+        fits.append(principal_components(frame.coordinates[points], int(vectors[cluster]), state.bases[cluster]))
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:
         scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])

@@ -63,6 +63,7 @@ class Subspaces:
     counts: NDArray[np.int64]
     scatter: NDArray[np.float64]
     labels: NDArray[np.int32]
+    price: float = 0.0
 
     @property
     def errors(self) -> NDArray[np.float64]:
@@ -77,7 +78,8 @@ class Subspaces:
 
     def copy(self) -> Subspaces:
         """An independent copy."""
-        return replace(self, **{name: value.copy() for name, value in vars(self).items()})
+        return replace(self, **{name: np.copy(value) if isinstance(value, np.ndarray) else value
+                                for name, value in vars(self).items()})
 
     def assign(self, other: Subspaces) -> None:
         """Take over another state's arrays."""

@@ -122,10 +122,10 @@ class LocalLight:
 
     def intensity(self, directions: ArrayLike) -> Array:
         """Radiant intensity (n, 3) from afar, W/sr, towards world directions (n, 3) away from the lamp (any length)."""
-        return self._pattern(np.asarray(directions, np.float64))[:, None] * self.peak_intensity
+        return self.pattern(np.asarray(directions, np.float64))[:, None] * self.peak_intensity
 
-    def _pattern(self, directions: Array) -> Array:
-        """Intensity as a share of the peak: (n,)."""
+    def pattern(self, directions: Array) -> Array:
+        """Intensity towards world directions (n, 3) as a share of the peak: (n,)."""
         if self.kind == "area":
             cosine = _cosines(directions, self.axis)
             return np.maximum(cosine, 0.0) * spread_pattern(cosine, self.spread)
@@ -160,7 +160,7 @@ class LocalLight:
         """The share of the pattern's energy (integral of the squared intensity) that `emission(order, negative)` holds:
         1 minus the squared error over the whole; 1 for a lamp that gives no light."""
         directions, weights = self._rule()
-        whole = float(np.sum(weights * self._pattern(directions) ** 2))
+        whole = float(np.sum(weights * self.pattern(directions) ** 2))
         plain = self._shares(order)
         kept = plain * expand_bands(_window(plain, negative)) if order > 1 and plain[0] > 0.0 else plain
         return 4.0 * math.pi * float(np.sum((2.0 * plain - kept) * kept)) / whole if whole > 0.0 else 1.0
@@ -168,7 +168,7 @@ class LocalLight:
     def _shares(self, order: int) -> Array:
         """Coefficients (order^2,) of the pattern itself: (1 / 4 pi) integral of pattern sqrt(4 pi) y_k."""
         directions, weights = self._rule()
-        values = multiply(evaluate(order, directions).T, (self._pattern(directions) * weights)[:, None])[:, 0]
+        values = multiply(evaluate(order, directions).T, (self.pattern(directions) * weights)[:, None])[:, 0]
         return values / math.sqrt(4.0 * math.pi)
 
     def _rule(self) -> tuple[Array, Array]:

@@ -9,7 +9,8 @@ from .svg_plots import percent
 
 Report = dict[str, Any]
 # What is measured -> the key of its entries in a report.
-PARTS = {"diffuse": "errors", "highlights": "highlight_errors", "bounced light of lamps": "local_errors"}
+PARTS = {"diffuse": "errors", "highlights": "highlight_errors", "bounced light of lamps": "local_errors",
+         "highlights of lamps": "local_highlight_errors"}
 
 
 def headline(report: Report) -> str:
@@ -19,16 +20,17 @@ def headline(report: Report) -> str:
     brightness: a faint highlight's large error may not show.
     """
     totals = {part: total_of(report, part) for part in PARTS}
-    told = [f"{percent(value)} ({part})" for part, value in totals.items() if value is not None]
+    names = {part: part for part in PARTS}
     if (report.get("settings") or {}).get("lighting") == "local":
-        told = [text.replace("(diffuse)", "(bounced light of lamps)") for text in told]
+        names["diffuse"] = "bounced light of lamps"
+    told = [f"{percent(value)} ({names[part]})" for part, value in totals.items() if value is not None]
     if not told:
         return "The error was not measured"
     text = f"Total error {', '.join(told)}"
     found = {(name, part): value for part in PARTS for name, value in object_errors(report, part).items()}
     if len({name for name, _ in found}) > 1:
         name, part = max(found, key=lambda key: found[key])
-        text += f"; worst: {name}, {percent(found[name, part])} ({part})"
+        text += f"; worst: {name}, {percent(found[name, part])} ({names[part]})"
     return text
 
 

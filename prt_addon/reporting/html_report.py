@@ -25,7 +25,8 @@ MOST_CURVES = len(svg_plots.SERIES_CLASSES)
 def render(report: Report) -> str:
     """The page of a valid report (see `report_file.problem_of`)."""
     style = Path(__file__).with_name("report.css").read_text("utf-8")
-    sections = (_attention, _times, _errors, _left_out, _compression, _bounces, _checks, _settings, _glossary)
+    sections = (_attention, _times, _errors, _left_out, _cloud, _compression, _bounces, _checks, _settings,
+                _glossary)
     body = "\n".join(section(report) for section in sections)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -121,7 +122,8 @@ def _errors(report: Report) -> str:
     of_lamps = ("Bounced light of lamps", wording.LOCAL_ERRORS)
     diffuse = of_lamps if report["settings"].get("lighting") == "local" else ("Diffuse light", wording.ERRORS)
     for (title, words), key in ((diffuse, "errors"), (("Highlights", wording.HIGHLIGHT_ERRORS), "highlight_errors"),
-                                (of_lamps, "local_errors")):
+                                (of_lamps, "local_errors"),
+                                (("Highlights under lamps", wording.LOCAL_HIGHLIGHT_ERRORS), "local_highlight_errors")):
         if report.get(key):
             parts += [f"<h3>{title}</h3>", *_budget(report[key], words, title)]
     if not parts:
@@ -154,14 +156,20 @@ def _budget(errors: dict[str, Any], wording_of: dict[str, tuple[str, str, str]],
 
 def _errors_of_objects(report: Report) -> str:
     """A table of objects, where several were measured."""
-    found = {part: object_errors(report, part) for part in ("diffuse", "highlights")}
+    only_lamps = report["settings"].get("lighting") == "local"
+    found = {"Lamps" if only_lamps else "Diffuse": object_errors(report, "diffuse"),
+             "Highlights": object_errors(report, "highlights")}
+    if report.get("local_errors"):
+        found["Lamps"] = object_errors(report, "bounced light of lamps")
+    if report.get("local_highlight_errors"):
+        found["Highlights under lamps"] = object_errors(report, "highlights of lamps")
     names = list(dict.fromkeys(name for errors in found.values() for name in errors))
     if len(names) < 2:
         return ""
     names.sort(key=lambda name: -max(errors.get(name, 0.0) for errors in found.values()))
     rows = [[escape(name), *(percent(errors[name]) if name in errors else "" for errors in found.values())]
             for name in names]
-    return "<h3>Object by object</h3>" + _table((("Object", False), ("Diffuse", True), ("Highlights", True)), rows)
+    return "<h3>Object by object</h3>" + _table((("Object", False), *((part, True) for part in found)), rows)
 
 
 def _left_out(report: Report) -> str:
@@ -170,6 +178,41 @@ def _left_out(report: Report) -> str:
         return _section("What was left out", "<p>Nothing: this scene needs every step of the bake.</p>")
     intro = '<p class="why">Work this scene does not need. Leaving it out makes no visible difference.</p>'
     return _section("What was left out", intro, _table((("What", False), ("Why", False), ("Saved", False)), rows))
+
+
+def _cloud(report: Report) -> str:
+    """The light cloud that stands for lamps, where the bake has one."""
+    local = report.get("local")
+    if not local:
+        return ""
+    if local.get("basis") == "surfaces":
+        return _lit_surfaces(local)
+    merged, zones = local["merged"], local["zones"]
+    each = local["columns"] / max(1, max(merged))
+    intro = ('<p class="why">Lamps that move are put together from the lights of a cloud around them. The points of '
+             "the scene are split into zones; within a zone, lights that do much the same are merged.</p>")
+    rows = [("Lights of the cloud", f"{count(local['lights'])}, {number(float(local['spacing']))} m apart"),
+            ("Places left out", f"{count(local['inside_bodies'])} inside of bodies, "
+             f"{count(local['near_surfaces'])} too near to surfaces"),
+            ("Zones", count(zones)),
+            ("Lights left after merging", count(merged[0]) if len(set(merged)) == 1 else
+             f"{count(min(merged))} to {count(max(merged))} in a zone, {count(sum(merged) / len(merged))} on average"),
+            ("Columns of a point's matrix", f"{count(local['columns'])}, {number(each)} for each light")]
+    table = _table((("Light cloud", False), ("", False)), [[escape(name), escape(text)] for name, text in rows])
+    return _section("Lights that stand for lamps", intro, table)
+
+
+def _lit_surfaces(local: dict[str, Any]) -> str:
+    """The surfaces that lamps shine on."""
+    intro = ('<p class="why">The light that lamps give to patches of surface is found by shadow rays when relighting,'
+             " whatever the lamp and wherever it is; what the patches send on is baked. Zones and merging, which a "
+             "cloud of lights needs, are left out: a column means the same at every point.</p>")
+    rows = [("Patches of surface", f"{count(local['patches'])}, by {count(local['triangles'])} triangles"),
+            ("Columns of a point's matrix", count(local["columns"])),
+            ("Learnt from", f"{count(local['lamps'])} lamps in the open, near to surfaces and outside"),
+            ("Of their light left out", f"{100.0 * float(local['left']):.2g} %")]
+    table = _table((("Lit surfaces", False), ("", False)), [[escape(name), escape(text)] for name, text in rows])
+    return _section("Surfaces that lamps shine on", intro, table)
 
 
 def _compression(report: Report) -> str:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _STATUS = Path("/proc/self/status")
+_MEMORY = Path("/proc/meminfo")
 _CLEAR = Path("/proc/self/clear_refs")
 
 
@@ -66,6 +68,40 @@ def peak_bytes() -> int:
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024
     return _peak_bytes_unix()
+
+
+def available_bytes() -> int | None:
+    """Memory that programs can still get without swapping; all there is where the system does not tell (macOS); None
+    where nothing is known."""
+    if sys.platform == "win32":
+        return _available_bytes_windows()
+    try:
+        for line in _MEMORY.read_text("ascii", errors="replace").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError):
+        return None
+
+
+def _available_bytes_windows() -> int | None:
+    """ullAvailPhys of the Windows function GlobalMemoryStatusEx."""
+    import ctypes
+    from ctypes import wintypes
+
+    sizes = ("TotalPhys", "AvailPhys", "TotalPageFile", "AvailPageFile", "TotalVirtual", "AvailVirtual",
+             "AvailExtendedVirtual")
+
+    class Status(ctypes.Structure):
+        _fields_ = [("Length", wintypes.DWORD), ("MemoryLoad", wintypes.DWORD),
+                    *((name, ctypes.c_uint64) for name in sizes)]
+
+    status = Status(Length=ctypes.sizeof(Status))
+    found = ctypes.WinDLL("kernel32").GlobalMemoryStatusEx(ctypes.byref(status))
+    return int(status.AvailPhys) if found else None
 
 
 def _peak_bytes_unix() -> int:

@@ -30,12 +30,13 @@ ERRORS = {
 
 # The same for the bounced light of lamps.
 LOCAL_ERRORS = {
-    "total": ("All together", "the light of a lamp between the cloud's lights, after at least one bounce, against a "
+    "total": ("All together", "the light of a lamp in the open, after at least one bounce, against a "
               "full simulation", ""),
     "sampling": ("Ray sampling", "a limited number of rays, and the mesh's vertices, carry light from surface to "
                  "surface", "more gather_directions, or a smaller spacing"),
-    "basis": ("Light cloud", "a lamp is put together from the lights of the cloud around it", "more cloud_lights, a "
-              "lower merge_response, or a smaller region"),
+    "basis": ("Columns of lamps", "the light that a lamp gives to surfaces is stored by patches of them and their "
+              "leading ways to differ, or put together from a cloud of lights", "more surface_columns and "
+              "surface_patches; with a cloud, more cloud_lights or a lower merge_response"),
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
 }
 
@@ -52,6 +53,18 @@ HIGHLIGHT_ERRORS = {
     "bounces": ("Reflections in reflections", "shiny surfaces show each other once; in what they show, further "
                 "reflections are spread evenly", ""),
     "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
+}
+
+# The same for highlights under lamps.
+LOCAL_HIGHLIGHT_ERRORS = {
+    "total": ("All together", "what highlights show of the surfaces that a lamp shines on, against a full simulation "
+              "with the materials' own reflection", ""),
+    "baked": ("As baked", "a limited number of rays, the columns that lamps are put together from, and the smooth "
+              "functions of the view", "more gather_directions, surface_columns (cloud_lights) or glossy_rows"),
+    "bounces": ("Reflections in reflections", "in what highlights show, further reflections are spread evenly", ""),
+    "compression": ("Compression", "points in one cluster share their data", "more clusters or vectors"),
+    "direct": ("The lamp itself", "its own highlight, which no bake holds, is shown with the same smooth functions of "
+               "the view; not part of all together", "more glossy_rows"),
 }
 
 # Upper end of each zone on the error plot and its name; a relative RMS of 1 % is about 2.5 of 255 grey levels at most.
@@ -71,6 +84,8 @@ GLOSSARY = (
      "weights for the cluster's vectors, which takes much less memory than storing everything for every point."),
     ("Overdraw", "how often the mesh's triangles would be drawn if each cluster were drawn on its own; 1 is best."),
     ("Supercluster", "several clusters that an old graphics card could hold at once and draw as one."),
+    ("Light cloud", "lights spread evenly over the space where lamps will move; the light that each of them sends"
+     " around by bounces is baked, and a lamp takes its own from those nearest to it."),
     ("Highlight", "the light that a surface reflects like a blurred mirror: it changes with the direction of view."),
 )
 

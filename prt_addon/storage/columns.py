@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Which lighting basis the columns of baked transfer belong to, as a header states it.
 
-Columns are those of distant light in spherical harmonics, then those of the lights of a local light cloud; either part
-may be missing. A cloud's columns mean other lights in every zone (Kristensen et al. 2005, 4.2); zones of fewer lights
-leave their last columns zero.
+Columns are those of distant light in spherical harmonics, then those of local light: of the lights of a cloud, or of
+the surfaces that lamps shine on; either part may be missing. A cloud's columns mean other lights in every zone
+(Kristensen et al. 2005, 4.2); zones of fewer lights leave their last columns zero.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from typing import Any
 from ..errors import StorageError
 
 SPHERICAL_HARMONICS, LIGHT_CLOUD, JOINED = "spherical_harmonics", "light_cloud", "joined"
+LIT_SURFACES = "lit_surfaces"
+LOCAL = (LIGHT_CLOUD, LIT_SURFACES)
 
 
 @dataclass(frozen=True)
 class Columns:
-    """order: of the distant light's spherical harmonics, 0 without that part; cloud: columns of the light cloud."""
+    """order: of the distant light's spherical harmonics, 0 without that part; cloud: columns of local light."""
 
     order: int
     cloud: int = 0
@@ -48,6 +50,14 @@ def columns_entry(columns: Columns, emission_order: int = 1, spacing: float = 0.
     return {"kind": JOINED, "parts": [distant, cloud]} if columns.order else cloud
 
 
+def surfaces_entry(columns: Columns, triangles: int, patches: int, clusters: int) -> dict[str, Any]:
+    """`columns` of a header whose local part is lit surfaces. clusters: of the object."""
+    distant = {"kind": SPHERICAL_HARMONICS, "order": columns.order, "condon_shortley": False}
+    lit = {"kind": LIT_SURFACES, "columns": columns.cloud, "triangles": triangles, "patches": patches,
+           "cluster_zone": [0] * clusters, "holds": "indirect light; axes . mean E / pi of the patches"}
+    return {"kind": JOINED, "parts": [distant, lit]} if columns.order else lit
+
+
 def parts_of(entry: Any) -> list[dict[str, Any]]:
     """The parts of a header's `columns`."""
     if not isinstance(entry, dict):
@@ -57,8 +67,8 @@ def parts_of(entry: Any) -> list[dict[str, Any]]:
 
 
 def cloud_part(entry: Any) -> dict[str, Any] | None:
-    """The part of a header's `columns` that is a light cloud's; None without."""
-    return next((part for part in parts_of(entry) if part.get("kind") == LIGHT_CLOUD), None)
+    """The part of a header's `columns` that is local light's; None without."""
+    return next((part for part in parts_of(entry) if part.get("kind") in LOCAL), None)
 
 
 def read_columns(header: dict[str, Any], subject: str, remedy: str) -> Columns:
@@ -66,9 +76,10 @@ def read_columns(header: dict[str, Any], subject: str, remedy: str) -> Columns:
     total = header["shape"][3]
     parts = parts_of(header.get("columns", {"kind": SPHERICAL_HARMONICS, "order": math.isqrt(total)}))
     kinds = [part.get("kind") for part in parts]
-    if kinds not in ([SPHERICAL_HARMONICS], [LIGHT_CLOUD], [SPHERICAL_HARMONICS, LIGHT_CLOUD]):
+    if kinds not in ([SPHERICAL_HARMONICS], *([local] for local in LOCAL),
+                     *([SPHERICAL_HARMONICS, local] for local in LOCAL)):
         raise StorageError(subject, "the header of its baked data states no known lighting basis", remedy)
-    cloud = parts[-1] if kinds[-1] == LIGHT_CLOUD else None
+    cloud = parts[-1] if kinds[-1] in LOCAL else None
     if cloud is not None:
         _check_cloud(cloud, header["shape"][0], subject, remedy)
     order = math.isqrt(total - (cloud["columns"] if cloud else 0)) if kinds[0] == SPHERICAL_HARMONICS else 0
@@ -79,7 +90,13 @@ def read_columns(header: dict[str, Any], subject: str, remedy: str) -> Columns:
 
 
 def _check_cloud(cloud: dict[str, Any], clusters: int, subject: str, remedy: str) -> None:
-    """Raise StorageError where a cloud's numbers contradict each other."""
+    """Raise StorageError where a local part's numbers contradict each other."""
+    if cloud["kind"] == LIT_SURFACES:
+        counts = [cloud.get(name) for name in ("columns", "triangles", "patches")]
+        if not (all(type(n) is int and n >= 0 for n in counts) and counts[0] > 0 and counts[2] > 0
+                and cloud.get("cluster_zone") == [0] * clusters):
+            raise StorageError(subject, "the header of its baked data states no valid lit surfaces", remedy)
+        return
     numbers = [cloud.get(name) for name in ("columns", "emission_order")]
     lights, zones = cloud.get("lights"), cloud.get("cluster_zone")
     valid = all(type(n) is int and n > 0 for n in numbers) and all(

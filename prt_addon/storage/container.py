@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from ..errors import StorageError
 from ..lighting.light_cloud import LightCloud
+from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..relighting.lamp_highlights import LampSurfaces
-from .columns import Columns, cloud_part, read_columns
+from .columns import LIT_SURFACES, Columns, cloud_part, read_columns
 from .lamp_surfaces import read_lamp_surfaces
 
 SCHEMA = 3  # highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too
@@ -46,7 +47,8 @@ class BakedTransfer:
     bases: (clusters, vectors + 1, rows, columns, channels) float32, vector 0 the cluster mean;
     albedo: (p, 3) float32; positions, normals: (p, 3) float32 world space when baked; triangles: (t, 3) int32;
     tangents: (p, 3) float32 likewise, unit, orthogonal to the normals; None where the only row is the diffuse one.
-    cloud: the local lights that columns belong to, world space when baked; None where all columns are distant light's.
+    cloud: the local lights or lit surfaces that columns belong to, world space when baked; None where all columns are
+    distant light's.
     lamp_surfaces: what materials do to the direct light of lamps, where there are a cloud and view-dependent rows.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
@@ -62,7 +64,7 @@ class BakedTransfer:
     normals: NDArray[np.float32]
     triangles: NDArray[np.int32]
     tangents: NDArray[np.float32] | None = None
-    cloud: LightCloud | None = None
+    cloud: LocalBasis | None = None
     lamp_surfaces: LampSurfaces | None = None
 
     @property
@@ -208,16 +210,22 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
                          read_lamp_surfaces(header, material, flat_kernels, points, subject, REBAKE))
 
 
-def flatten_cloud(cloud: LightCloud) -> NDArray[np.float64]:
-    """A cloud's positions as one list of numbers: its zones' lights, then the lights of the cloud before merging."""
+def flatten_cloud(cloud: LocalBasis) -> NDArray[np.floating]:
+    """A cloud's positions as one list of numbers: its zones' lights, then the lights of the cloud before merging. Of
+    lit surfaces: the triangles' corners, the corners' patches (whole numbers below 2^24), the axes, all float32."""
+    if isinstance(cloud, LitSurfaces):
+        return np.concatenate([cloud.corners.ravel(), cloud.patch.ravel(), cloud.axes.ravel()]).astype(np.float32)
     return np.concatenate([cloud.positions.ravel(), cloud.dense.ravel()])
 
 
-def read_cloud(header: dict[str, Any], flat_cloud: NDArray | None, subject: str) -> LightCloud | None:
-    """The light cloud of a header and its list of numbers; None where the header states none. Raises StorageError."""
+def read_cloud(header: dict[str, Any], flat_cloud: NDArray | None, subject: str) -> LocalBasis | None:
+    """The light cloud, or lit surfaces, of a header and its list of numbers; None where the header states none. Raises
+    StorageError."""
     part = cloud_part(header.get("columns"))
     if part is None:
         return None
+    if part["kind"] == LIT_SURFACES:
+        return _read_surfaces(part, flat_cloud, subject)
     starts = np.concatenate([[0], np.cumsum(part["lights"])])
     numbers = None if flat_cloud is None else np.asarray(flat_cloud, np.float64)
     if numbers is None or numbers.size % 3 or numbers.size < 3 * starts[-1] or not np.isfinite(numbers).all():
@@ -225,3 +233,16 @@ def read_cloud(header: dict[str, Any], flat_cloud: NDArray | None, subject: str)
     places = numbers.reshape(-1, 3)
     return LightCloud(places[:starts[-1]], starts, part["emission_order"], places[starts[-1]:], part["spacing"],
                       part["radius"])
+
+
+def _read_surfaces(part: dict[str, Any], flat: NDArray | None, subject: str) -> LitSurfaces:
+    """Lit surfaces of their part of a header and their list of numbers. Raises StorageError."""
+    triangles, patches, columns = part["triangles"], part["patches"], part["columns"]
+    numbers = None if flat is None else np.asarray(flat, np.float64)
+    if numbers is None or numbers.size != 12 * triangles + columns * patches or not np.isfinite(numbers).all():
+        raise StorageError(subject, "the surfaces that lamps shine on are missing or broken", REBAKE)
+    corners, patch, axes = np.split(numbers, [9 * triangles, 12 * triangles])
+    if triangles and not (patch.min() >= -1 and patch.max() < patches):
+        raise StorageError(subject, "the surfaces that lamps shine on are missing or broken", REBAKE)
+    return LitSurfaces(corners.reshape(-1, 3, 3).astype(np.float32), patch.reshape(-1, 3).astype(np.int32),
+                       axes.reshape(columns, patches).astype(np.float32))

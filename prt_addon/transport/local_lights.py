@@ -131,12 +131,24 @@ class LightSolver:
                                                           self.emission_order, self.radius), first, half)
             self._conserve_flux(self._near, direct, positions[part])
             yield first + half
-            response = yield from _scaled(self._bounced(direct), first + half, half)
-            take(part, response)
-            if view is not None:
-                response += direct[:, :, None]
-                response *= self.albedo[:, None, :]
-                yield from _scaled(view(part, response), first + 2.0 * half, share - 2.0 * half)
+            yield from _scaled(self._carried(part, direct, take, view), first + half, share - half)
+
+    def solve_fields(self, fields: Single, take: Consumer, view: Viewer | None = None) -> Generator[float]:
+        """The same for direct fields (r, n), E / pi at the gather's receivers, in place of lights."""
+        for start in range(0, fields.shape[1], COLUMNS):
+            part = slice(start, min(start + COLUMNS, fields.shape[1]))
+            yield from _scaled(self._carried(part, np.ascontiguousarray(fields[:, part]), take, view),
+                               start / fields.shape[1], (part.stop - start) / fields.shape[1])
+
+    def _carried(self, part: slice, direct: Single, take: Consumer, view: Viewer | None) -> Generator[float]:
+        """Carry the direct fields of a block through the operator and hand them on."""
+        solving = 1.0 if view is None else 0.5
+        response = yield from _scaled(self._bounced(direct), 0.0, solving)
+        take(part, response)
+        if view is not None:
+            response += direct[:, :, None]
+            response *= self.albedo[:, None, :]
+            yield from _scaled(view(part, response), solving, 1.0 - solving)
 
     @cached_property
     def _near(self) -> NearTriangles:

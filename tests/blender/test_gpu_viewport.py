@@ -42,7 +42,7 @@ def handlers(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[Any, str]]]
 def test_enable_twice_replaces_the_list_and_disable_leaves_nothing(handlers: list) -> None:
     viewport.enable(list)
     viewport.enable(list)
-    assert [phase for _, phase in handlers] == ["PRE_VIEW", "POST_VIEW"]
+    assert [phase for _, phase in handlers] == ["PRE_VIEW", "POST_VIEW", "POST_PIXEL"]
     assert viewport.is_enabled() and viewport.status().enabled
     viewport.disable()
     viewport.disable()

@@ -21,7 +21,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
 FAST = ["--preset", "draft", "--set", "directions=1024", "--set", "gather_directions=512", "--set", "spacing=0",
         "--set", "error_receivers=0", "--set", "bounce_error=1e-3", "--set", "compression_error=1e-3",
         "--set", "encoder=iterative", "--set", "vectors=12", "--set", "cloud_lights=125",
-        "--set", "merge_response=0.01", "--set", "zone_receivers=200"]
+        "--set", "merge_response=0.01", "--set", "zone_receivers=200", "--set", "lamp_basis=cloud"]
 LAMP = (0.22, -0.13, 1.31)
 CELLS = 10
 
@@ -204,7 +204,7 @@ def test_a_wrong_region_is_refused_in_one_line(folder: Path, region: str, words:
 
 @pytest.mark.parametrize("lighting, key, basis, words", [
     ("environment", "errors", 0.01, "(diffuse)"), ("environment", "errors", 0.09, "sharper than the order"),
-    ("local", "errors", 0.09, "few lights"), ("environment,local", "local_errors", 0.09, "few lights")])
+    ("local", "errors", 0.09, "few columns"), ("environment,local", "local_errors", 0.09, "few columns")])
 def test_the_message_after_a_bake_knows_what_was_measured(lighting: str, key: str, basis: float, words: str) -> None:
     from prt.operators.bake_session import baked_message
 

@@ -134,11 +134,13 @@ class Drawn:
     row = box = column
 
 
-@pytest.mark.parametrize(("lighting", "shows_cloud"), [("environment", False), ("local", True), ("both", True)])
-def test_panels_draw_every_setting(lighting: str, shows_cloud: bool, settings: bpy.types.PropertyGroup) -> None:
+@pytest.mark.parametrize(("lighting", "basis"), [("environment", None), ("local", "cloud"), ("both", "surfaces")])
+def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: bpy.types.PropertyGroup) -> None:
     from prt.panels import sidebar
 
     settings.lighting = lighting
+    if basis is not None:
+        settings.lamp_basis = basis
     found: set[str] = set()
     context = types.SimpleNamespace(scene=bpy.context.scene, window_manager=bpy.context.window_manager,
                                     selected_objects=[], preferences=bpy.context.preferences,
@@ -148,6 +150,8 @@ def test_panels_draw_every_setting(lighting: str, shows_cloud: bool, settings: b
             drawing = types.SimpleNamespace(layout=Drawn(found))
             drawing.column = lambda context, panel=panel, drawing=drawing: panel.column(drawing, context)
             panel.draw(drawing, context)
-    cloud = {"cloud_region", "cloud_collection", "cloud_lights", "cloud_spacing", "merge_response", "zone_receivers"}
-    assert found & cloud == (cloud if shows_cloud else set())
-    assert set(names(settings)) - cloud <= found
+    lamps = {"lamp_basis", "cloud_region", "cloud_collection", "cloud_lights", "cloud_spacing"}
+    own = {"cloud": {"merge_response", "zone_receivers"}, "surfaces": {"surface_columns"}}
+    every = lamps | own["cloud"] | own["surfaces"]
+    assert found & every == (set() if basis is None else lamps | own[basis])
+    assert set(names(settings)) - every <= found

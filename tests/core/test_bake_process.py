@@ -37,7 +37,13 @@ def run_job(folder):
         raise ZeroDivisionError("a defect")
     elif kind == "runs out of memory":
         raise MemoryError
-    elif kind == "sleeps":
+    elif kind in ("sleeps", "leaves much"):
+        if kind == "leaves much":
+            (folder / "responses-abc").mkdir()
+            (folder / "responses-abc" / "zone_0.npy").write_bytes(b"much")
+            (folder / ".local.npz.1.part").write_bytes(b"half")
+            (folder / "gather.npz").write_bytes(b"whole")
+        yield Progress("encoding", 0.5, 1000, None)
         time.sleep(60)
     elif kind == "chatters":
         for number in range(20000):
@@ -53,7 +59,7 @@ def package(tmp_path: Path) -> Path:
     (folder / "__init__.py").touch()
     (folder / "baking" / "__init__.py").touch()
     shutil.copy(PACKAGE / "errors.py", folder)
-    for name in ("process.py", "worker.py"):
+    for name in ("process.py", "worker.py", "leftovers.py"):
         shutil.copy(PACKAGE / "baking" / name, folder / "baking")
     (folder / "baking" / "job.py").write_text(STAND_IN)
     return folder
@@ -124,6 +130,27 @@ def test_cancel_ends_the_child_and_a_new_one_can_start(process_module: ModuleTyp
     assert [m["type"] for m in started(process_module, tmp_path, "works").wait()][-1] == "done"
 
 
+@pytest.mark.parametrize("way", ["cancel", "kill"])
+def test_no_end_leaves_anything_unfinished(process_module: ModuleType, tmp_path: Path, way: str) -> None:
+    """Finished stages stay, half-written files and the folder of responses go."""
+    process = started(process_module, tmp_path, "leaves much")
+    messages: list = []
+    while len(messages) < 2:
+        messages += process.poll()
+        time.sleep(0.01)
+    assert len(unfinished(tmp_path / "job")) == 2
+    if way == "cancel":
+        process.cancel()
+    else:
+        process.process.kill()
+        assert list(process.wait())[-1]["type"] == "error"
+    assert not unfinished(tmp_path / "job") and (tmp_path / "job" / "gather.npz").exists()
+
+
+def unfinished(job: Path) -> list[Path]:
+    return [*job.glob("responses-*"), *job.glob(".*.part")]
+
+
 def test_progress_is_thinned_out(process_module: ModuleType, tmp_path: Path) -> None:
     messages = list(started(process_module, tmp_path, "chatters").wait())
     assert messages[-1]["type"] == "done" and len(messages) < 100
@@ -145,7 +172,7 @@ def test_child_dies_with_its_parent(package: Path, tmp_path: Path) -> None:
     """The parent is killed without a chance to clean up."""
     job = tmp_path / "job"
     job.mkdir()
-    (job / "kind").write_text("sleeps")
+    (job / "kind").write_text("leaves much")
     parent = tmp_path / "parent.py"
     parent.write_text(f'''
 import sys, time
@@ -154,19 +181,23 @@ from pathlib import Path
 from stand_in.baking.process import BakeProcess
 process = BakeProcess([sys.executable, "-I"], Path({str(job)!r}))
 process.start()
-while not process.poll():
+messages = []
+while len(messages) < 2:
+    messages += process.poll()
     time.sleep(0.01)
 print(process.process.pid, flush=True)
 time.sleep(60)
 ''')
     running = subprocess.Popen([sys.executable, str(parent)], stdout=subprocess.PIPE, text=True)
     child = int(running.stdout.readline())
+    assert unfinished(job)
     running.kill()
     running.wait()
     deadline = time.monotonic() + 5.0
     while _alive(child):
         assert time.monotonic() < deadline, "the child outlived its parent"
         time.sleep(0.05)
+    assert not unfinished(job) and (job / "gather.npz").exists()
 
 
 def _alive(pid: int) -> bool:

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -336,6 +338,57 @@ def test_the_preview_gets_its_receivers_order_and_rows():
     np.testing.assert_allclose(found[:, 0], plain, rtol=1e-6)
     assert not found[:, 1:].any()
     assert plain.any()
+
+
+def test_lamps_that_stay_cost_no_rays_and_power_only_scales():
+    """A lamp's light is kept until it moves; forgotten where it is no longer among the lamps."""
+    scene = sphere(subdivisions=3)
+    tracer = tracer_of(scene, FLOOR)
+    baked = SimpleNamespace(positions=scene.positions, normals=scene.positions, bases=np.zeros((1, 2, 1, 9, 1)),
+                            triangles=scene.triangles, lamp_surfaces=None)
+    direct, near, far = DirectLight(tracer, baked), (1.0, 2.0, 3.0), (-2.0, 0, 1)
+    first = direct.of([lamp("point", near, radius=0.2), lamp("area", far, size=(1, 2))])
+    assert tracer.rays > 0
+    rays = tracer.rays
+    dim = direct.of([lamp("point", near, power=(0.5, -2.0, 0.0), radius=0.2), lamp("area", far, size=(1, 2))])
+    assert tracer.rays == rays
+    fresh = DirectLight(tracer, baked).of([lamp("point", near, power=(0.5, -2.0, 0.0), radius=0.2)])
+    other = DirectLight(tracer, baked).of([lamp("area", far, size=(1, 2))])
+    np.testing.assert_array_equal(dim, fresh + other)
+    rays = tracer.rays
+    direct.of([lamp("point", (1.1, 2.0, 3.0), radius=0.2), lamp("area", far, size=(1, 2))])
+    moved = tracer.rays - rays
+    assert 0 < moved <= 16 * len(scene.positions)
+    np.testing.assert_array_equal(
+        direct.of([lamp("point", near, radius=0.2), lamp("area", far, size=(1, 2))]), first)
+    assert tracer.rays > rays + moved
+
+
+def test_fewer_samples_change_penumbrae_only_and_by_their_steps():
+    """While a lamp is dragged: what is wholly lit or wholly dark is the same, the rest within two points of four."""
+    blocker = plane(size=1.0, height=1.0, cells=1)
+    ground = plane(size=6.0, cells=60)
+    tracer = tracer_of(blocker, ground)
+    normals = np.tile([0.0, 0.0, 1.0], (len(ground.positions), 1))
+    baked = SimpleNamespace(positions=ground.positions, normals=normals, bases=np.zeros((1, 2, 1, 9, 1)),
+                            triangles=ground.triangles, lamp_surfaces=None)
+    direct, open_air = DirectLight(tracer, baked), DirectLight(tracer_of(ground), baked)
+    ball = lamp("point", (0.3, 0.0, 2.0), radius=0.3)
+    quick, fine, unshadowed = direct.of([ball], [4]), direct.of([ball]), open_air.of([ball])
+    penumbra = (fine > 0.0) & (fine < unshadowed * (1 - 1e-6))
+    assert 0.02 < penumbra.mean() < 0.5
+    difference = np.abs(quick - fine) / unshadowed
+    assert np.mean(difference[~penumbra] > 1e-6) < 0.02  # at its rim, where a quarter of the lamp is all or nothing
+    assert difference.max() <= 0.5
+    assert 0.01 < np.sqrt(np.mean(difference[penumbra] ** 2)) < 0.15
+
+    def largest_step(samples):
+        """From one place of the lamp to the next one, 2 cm on: what could be seen as flicker."""
+        shares = [direct.of([replace(ball, matrix=lamp("point", (0.3 + 0.02 * k, 0.0, 2.0)).matrix)], [samples])
+                  / unshadowed for k in range(9)]
+        return max(float(np.sqrt(np.mean((b - a) ** 2))) for a, b in itertools.pairwise(shares))
+
+    assert largest_step(4) < 2.0 * largest_step(16), largest_step(4) / largest_step(16)
 
 
 def test_a_cutoff_costs_no_more_than_itself():

@@ -23,9 +23,10 @@ from prt_addon.storage.columns import Columns, columns_entry, read_columns
 from prt_addon.tracing.tracer import Tracer
 from tests.core.shapes import box, make
 
-LOCAL = BakeSettings(lighting="local", cloud_lights=64, cloud_emission=1, zone_receivers=300, gather_directions=512,
-                     bounce_error=1e-3, clusters=48, vectors=10, encoder="iterative", compression_error=1e-3,
-                     spacing=0.06, error_receivers=24, error_paths=2048, threads=1, merge_response=0.02)
+LOCAL = BakeSettings(lighting="local", lamp_basis="cloud", cloud_lights=64, cloud_emission=1, zone_receivers=300,
+                     gather_directions=512, bounce_error=1e-3, clusters=48, vectors=10, encoder="iterative",
+                     compression_error=1e-3, spacing=0.06, error_receivers=24, error_paths=2048, threads=1,
+                     merge_response=0.02)
 
 
 def room(wall=False, albedo=(0.7, 0.5, 0.3)):

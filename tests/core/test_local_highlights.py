@@ -50,7 +50,8 @@ class KeepingBake(_Bake):
 
 def until_encoding(scene, **options):
     """A bake of local lights, run up to its encoding."""
-    wanted = {"lighting": "local", "spacing": "0", "threads": "1", "merge_response": "0", "gather_directions": "1024",
+    wanted = {"lighting": "local", "lamp_basis": "cloud",
+              "spacing": "0", "threads": "1", "merge_response": "0", "gather_directions": "1024",
               "directions": "1024"}
     settings = make_settings("standard", wanted | {name: str(value) for name, value in options.items()})
     bake = KeepingBake(scene, transport_settings(settings), None, None, {}, np.empty((0, 4, 4)))

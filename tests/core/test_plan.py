@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from prt_addon.baking import memory
 from prt_addon.baking.plan import PROCESS_BYTES, make_plan
-from prt_addon.baking.recipe import bake, exhaust
+from prt_addon.baking.recipe import bake, exhaust, transport_settings
 from prt_addon.baking.settings import make_settings
+from prt_addon.errors import BadScene
+from prt_addon.reporting.stages import available_bytes
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.scene.surface_material import SurfaceMaterial
 from tests.core.shapes import plane, sphere
@@ -36,24 +39,28 @@ def still_life(kind, subdivisions=4):
 CHILD = """
 import json, sys
 from prt_addon.reporting.stages import peak_bytes
-from tests.core.test_plan import QUICK, bake, exhaust, make_plan, make_settings, still_life
-kind, preset, subdivisions = sys.argv[1:]
+from tests.core.test_plan import QUICK, bake, exhaust, make_plan, make_settings, still_life, transport_settings
+kind, preset, subdivisions, *more = sys.argv[1:]
 scene = still_life(kind, int(subdivisions))
-settings = make_settings(preset, {**QUICK, "encoder": "static"})
+settings = make_settings(preset, {**QUICK, "encoder": "static", **dict(item.split("=") for item in more)})
 before = peak_bytes()  # not getrusage: there a child begins with the peak of the process that started it
 peak = max(stage["peak_bytes"] for stage in exhaust(bake(scene, settings)).report["stages"])
-print(json.dumps([before, peak, make_plan(scene, settings, None).peak_bytes]))
+plan = make_plan(scene, transport_settings(settings), None)
+print(json.dumps([before, peak, plan.peak_bytes, plan.least_bytes]))
 """
+LAMPS = ("lighting=local", "lamp_basis=cloud", "cloud_emission=2", "glossy_rows=4", "cloud_lights=48", "vectors=4")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory otherwise")
-@pytest.mark.parametrize(("kind", "preset", "subdivisions"), [
-    ("grey", "standard", 5), ("metal", "high", 4)])
-def test_memory_is_about_as_foretold(kind, preset, subdivisions):
-    done = subprocess.run([sys.executable, "-c", CHILD, kind, preset, str(subdivisions)], cwd=ROOT, check=True,
+@pytest.mark.parametrize(("kind", "preset", "subdivisions", "more"), [
+    ("grey", "standard", 5, ()), ("metal", "high", 4, ()), ("grey", "standard", 5, LAMPS),
+    ("metal", "draft", 4, LAMPS)])
+def test_memory_is_about_as_foretold(kind, preset, subdivisions, more):
+    """Lamps of spots on metal: rows x columns x channels of highlights are most of it."""
+    done = subprocess.run([sys.executable, "-c", CHILD, kind, preset, str(subdivisions), *more], cwd=ROOT, check=True,
                           capture_output=True, text=True, timeout=100)
-    before, peak, foretold = json.loads(done.stdout)
-    assert peak < foretold < 2.0 * (peak - before + PROCESS_BYTES)
+    before, peak, foretold, least = json.loads(done.stdout)
+    assert least < peak < foretold < 2.0 * (peak - before + PROCESS_BYTES)
 
 
 def test_stored_bytes_are_about_as_foretold():
@@ -69,10 +76,36 @@ def test_local_lights_count():
     """As columns in what is stored, as responses on disk, and in memory; merging makes them fewer."""
     scene = still_life("grey")
     distant, local, both, all_kept = (make_plan(scene, make_settings("standard", {**QUICK, **more}), None) for more in (
-        {}, {"lighting": "local"}, {"lighting": "environment,local"},
-        {"lighting": "environment,local", "merge_response": "0"}))
+        {}, {"lighting": "local", "lamp_basis": "cloud"}, {"lighting": "environment,local", "lamp_basis": "cloud"},
+        {"lighting": "environment,local", "lamp_basis": "cloud", "merge_response": "0"}))
     assert distant.stored_bytes < both.stored_bytes < all_kept.stored_bytes and local.stored_bytes < both.stored_bytes
     responses = 4 * both.receivers * 216 * both.needs.channels
     assert both.disk_bytes > distant.disk_bytes + responses and both.peak_bytes > distant.peak_bytes
-    directed = make_plan(scene, make_settings("standard", {**QUICK, "lighting": "local", "cloud_emission": "3"}), None)
+    directed = make_plan(scene, make_settings("standard", {
+        **QUICK, "lighting": "local", "lamp_basis": "cloud", "cloud_emission": "3"}), None)
     assert directed.disk_bytes > 8 * responses
+    surfaces = make_plan(scene, make_settings("standard", {**QUICK, "lighting": "local"}), None)
+    assert surfaces.disk_bytes > distant.disk_bytes + 4 * surfaces.receivers * 2048 * surfaces.needs.channels
+    assert surfaces.stored_bytes > distant.stored_bytes
+
+
+def test_a_bake_that_can_not_fit_is_refused_with_a_remedy(monkeypatch):
+    """Much more than there is: refused before the first ray; somewhat more: a warning, in the report, too."""
+    scene = still_life("metal", 2)
+    settings = make_settings("draft", {**QUICK, "lighting": "local", "lamp_basis": "cloud", "cloud_emission": "2",
+                                       "cloud_lights": "8"})
+    plan = make_plan(scene, transport_settings(settings), None)
+    assert plan.least_bytes < plan.peak_bytes
+    monkeypatch.setattr(memory, "available_bytes", lambda: plan.least_bytes - 1)
+    with pytest.raises(BadScene, match=r"at least about .* MB are free\. Choose fewer lights .*glossy_rows"):
+        next(bake(scene, settings))
+    monkeypatch.setattr(memory, "available_bytes", lambda: plan.peak_bytes - 1)
+    assert any("may need" in line for line in exhaust(bake(scene, settings)).report["scene"]["warnings"])
+    monkeypatch.setattr(memory, "available_bytes", lambda: plan.peak_bytes)
+    assert memory.memory_warning(plan, settings) is None
+    monkeypatch.setattr(memory, "available_bytes", lambda: None)
+    assert memory.memory_warning(plan, settings) is None
+
+
+def test_the_system_tells_how_much_memory_there_is():
+    assert 1e7 < available_bytes() < 1e14

@@ -77,6 +77,37 @@ def test_headline_says_what_it_covers_and_names_the_worst_object() -> None:
     assert headline(made_up_report() | {"errors": {}}) == "The error was not measured"
 
 
+def with_lamps(lighting: str) -> dict[str, Any]:
+    """A bake with a light cloud; of lamps alone the budget of their light is the only one."""
+    report = with_highlights()
+    report["settings"]["lighting"] = lighting
+    report["local"] = {"lights": 216, "spacing": 0.25, "inside_bodies": 12, "near_surfaces": 34, "emission_order": 2,
+                       "zones": 3, "merged": [80, 64, 96], "columns": 384, "merged_response": "arithmetic",
+                       "warnings": []}
+    names = ("baked", "bounces", "compression", "total", "direct")
+    report["local_highlight_errors"] = dict.fromkeys(names, report["highlight_errors"]["total"])
+    if lighting == "local":
+        report["local_errors"], report["highlight_errors"] = {}, {}
+    else:
+        report["local_errors"] = copy.deepcopy(report["errors"])
+    return report
+
+
+@pytest.mark.parametrize("lighting", ["local", "environment,local"])
+def test_page_and_headline_tell_of_lamps_and_their_cloud(lighting: str) -> None:
+    report = with_lamps(lighting)
+    text = headline(report)
+    both = lighting != "local"
+    assert ("(diffuse)" in text) == both and "(bounced light of lamps)" in text and "(highlights of lamps)" in text
+    page = render(report)
+    for told in ("216, 0.25 m apart", "12 inside of bodies, 34 too near", "64 to 96 in a zone, 80 on average",
+                 "384, 4 for each light", "Bounced light of lamps", "Highlights under lamps", "The lamp itself"):
+        assert told in page, told
+    assert ("<h3>Diffuse light</h3>" in page) == both
+    assert ">Lamps</th>" in page and (">Diffuse</th>" in page) == both
+    assert "Lights that stand for lamps" not in render(with_highlights())
+
+
 def test_page_shows_highlights_objects_and_coherence(tmp_path: Path) -> None:
     report = with_highlights()
     write_report(tmp_path / "report.json", report)

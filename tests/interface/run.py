@@ -26,6 +26,8 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 UI_SECONDS = 600
+# What drives an interface, and what makes its scene.
+SCRIPTS = {"interface": ("in_blender.py", "make_scene.py"), "lamps": ("lamps_in_blender.py", "make_room.py")}
 COMMAND_SECONDS = 240
 
 
@@ -112,13 +114,61 @@ def check_interrupt(blender: Blender, scene: Path) -> None:
     assert not output.exists()
 
 
-def interface_results(blender: Blender, scene: Path) -> list[tuple[str, str]]:
-    """Name and failure (empty: passed) of each step in_blender.py took."""
-    results = blender.output / "interface.json"
-    blender.script("in_blender.py", str(blender.output), str(scene))
+def check_kill_among_lamps(blender: Blender, scene: Path) -> None:
+    """Blender is killed while its child bakes local lights: the child ends and cleans up, and the next bake resumes."""
+    output, report = blender.output / "killed.blend", blender.output / "killed.json"
+    command = ("--command", "prt", "bake", "--input", str(scene), "--output", str(output), "--report", str(report),
+               "--preset", "draft", "--lighting", "local", "--set", "cloud_region=Region", "--set", "cloud_lights=300",
+               "--set", "lamp_basis=cloud",
+               "--set", "merge_response=0", "--set", "error_receivers=0", "--set", "spacing=0.02")
+    running = blender.start_command(*command)
+    for line in running.stderr:
+        if "Local lights" in line:
+            break
+    jobs = Path(blender.environment["BLENDER_USER_RESOURCES"])
+    deadline = time.monotonic() + 30.0
+    while not list(jobs.rglob("responses-*")):
+        assert time.monotonic() < deadline and running.poll() is None, "no responses on disk"
+        time.sleep(0.02)
+    os.kill(blender_process(output), signal.SIGKILL)
+    running.communicate(timeout=30)
+    assert running.returncode != 0 and not output.exists()
+    while left := [*jobs.rglob("responses-*"), *jobs.rglob("bake-*/.*.part")]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.1)
+    done = blender.command(*command)
+    assert done.returncode == 0, done.stderr
+    resumed = json.loads(report.read_text())["resumed"]
+    assert resumed == ["gather", "direct", "interreflection"], resumed
+
+
+def blender_process(output: Path) -> int:
+    """The number of the Blender that writes this file: what was started may be a wrapper around it."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            name, command = (folder / "comm").read_text(), (folder / "cmdline").read_bytes()
+            if name == "blender\n" and str(output).encode() in command:
+                return int(folder.name)
+        except OSError:  # it ended meanwhile
+            continue
+    raise AssertionError("Blender is not running")
+
+
+def interface_results(blender: Blender, script: str, results: str, scene: Path) -> list[tuple[str, str]]:
+    """Name and failure (empty: passed) of each step that a script took."""
+    results = blender.output / results
+    blender.script(script, str(blender.output), str(scene))
     if not results.is_file():
-        return [("the interface script", f"left no results; see {blender.output / 'in_blender.py.log'}")]
+        return [(script, f"left no results; see {blender.output / f'{script}.log'}")]
     return [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+
+
+def make_scene(blender: Blender, script: str, outcomes: list[tuple[str, str]]) -> Path:
+    """The scene that a script makes, as scenes are told apart by it; how that went is noted."""
+    scene = blender.output / f"{Path(script).stem}.blend"
+    made = blender.command("--python-exit-code", "1", "--python", str(HERE / script), "--", str(scene))
+    outcomes.append((script, "" if made.returncode == 0 and scene.is_file() else made.stdout + made.stderr))
+    return scene
 
 
 def run_check(check: Callable[..., None], *arguments: object) -> tuple[str, str]:
@@ -136,7 +186,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--ui", default="blender")
     parser.add_argument("--headless", default="blender --background")
-    parser.add_argument("--only", choices=("commands", "interface"), default=None)
+    parser.add_argument("--only", choices=("commands", *SCRIPTS), default=None)
     arguments = parser.parse_args()
     output = arguments.output.resolve()
     shutil.rmtree(output, ignore_errors=True)
@@ -144,14 +194,14 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as resources:
         blender = Blender(arguments.ui, arguments.headless, output, Path(resources))
         outcomes = [run_check(check_install, blender, arguments.zip.resolve())]
-        scene = output / "scene.blend"
-        made = blender.command("--python-exit-code", "1", "--python", str(HERE / "make_scene.py"), "--", str(scene))
-        outcomes.append(("make_scene", "" if made.returncode == 0 and scene.is_file() else made.stdout + made.stderr))
-        if arguments.only != "interface":
+        if arguments.only in (None, "commands"):
+            scene = make_scene(blender, "make_scene.py", outcomes)
             outcomes += [run_check(check, blender, scene)
                          for check in (check_bad_arguments, check_command_bake, check_interrupt)]
-        if arguments.only != "commands":
-            outcomes += interface_results(blender, scene)
+            outcomes.append(run_check(check_kill_among_lamps, blender, make_scene(blender, "make_room.py", outcomes)))
+        for name, (script, maker) in SCRIPTS.items():
+            if arguments.only in (None, name):
+                outcomes += interface_results(blender, script, f"{name}.json", make_scene(blender, maker, outcomes))
     for name, failure in outcomes:
         print(f"{'failed' if failure else 'passed'}: {name}" + (f"\n    {failure}" if failure else ""))
     failed = sum(bool(failure) for _, failure in outcomes)

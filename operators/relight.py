@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""prt.relight: the light of this moment as a colour attribute, for materials, renders and exporters."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ..prt_addon.blender.stored import baked_mesh
+from ..prt_addon.errors import PRTError, StorageError
+from .properties import session
+from .relit import read_all, relit
+
+ATTRIBUTE = "PRT Light"
+
+
+class PRT_OT_relight(bpy.types.Operator):
+    """Write the light that leaves all baked objects now into the colour attribute "PRT Light" of the meshes that carry
+    their bakes (scene-linear, albedo included): for Color Attribute nodes, renders and exporters. Costs milliseconds.
+    Highlights are those seen along the normals"""
+
+    bl_idname = "prt.relight"
+    bl_label = "Apply to Color Attribute"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Leave edit mode first: the bakes can't be read in it")
+            return False
+        if not any(baked_mesh(o) is not None for o in context.scene.objects):
+            cls.poll_message_set("Nothing is baked: bake an object first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        scene = context.scene
+        try:
+            baked = read_all(scene, scene.name)
+            lit = relit(scene, baked, window=scene.prt.window)
+            for name, transfer in baked.items():
+                write_colours(baked_mesh(scene.objects[name]), lit.radiance(name, transfer))
+        except PRTError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for warning in lit.warnings:
+            self.report({"WARNING"}, warning)
+        carriers = [name for name in baked if baked_mesh(scene.objects[name]) != scene.objects[name].data]
+        text = f"Lit {len(baked)} object{'' if len(baked) == 1 else 's'}"
+        if carriers:
+            text += f"; of {', '.join(carriers)} the attribute is on the hidden receiver mesh"
+        self.report({"INFO"}, text)
+        if session(context).preview:
+            context.view_layer.update()
+        return {"FINISHED"}
+
+
+def write_colours(mesh: bpy.types.Mesh, radiance: np.ndarray) -> None:
+    """Put radiance (points, 3) into the attribute, which is made where it is missing. Raises StorageError where
+    something else has its name."""
+    if mesh.library is not None:
+        raise StorageError(mesh.name, "it is linked from another file", "Make it local")
+    attribute = mesh.attributes.get(ATTRIBUTE)
+    if attribute is None:
+        attribute = mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
+    if (attribute.name, attribute.data_type, attribute.domain) != (ATTRIBUTE, "FLOAT_COLOR", "POINT"):
+        raise StorageError(mesh.name, f"an attribute named {ATTRIBUTE} of another kind is in the way",
+                           "Rename or remove it")
+    colours = np.ones((len(radiance), 4), np.float32)
+    colours[:, :3] = radiance
+    attribute.data.foreach_set("color", colours.ravel())
+    mesh.update_tag()

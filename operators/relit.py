@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""All baked objects of a scene under the light that it has now, once: for commands and operators alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..prt_addon.blender.fingerprint import surroundings
+from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.stored import baked_objects, read_baked, stale
+from ..prt_addon.errors import BadScene
+from ..prt_addon.relighting.exit_radiance import view_radiance
+from ..prt_addon.relighting.scene_light import joined_light
+from ..prt_addon.storage.container import BakedTransfer
+from .scene_lamps import SceneLamps
+
+
+@dataclass(frozen=True)
+class Lit:
+    """By name of the baked object: light in its columns, and direct light of lamps (None for none); warnings for the
+    user, each once."""
+
+    light: dict[str, NDArray[np.float32]]
+    direct: dict[str, NDArray[np.float32] | None]
+    warnings: tuple[str, ...]
+
+    def radiance(self, name: str, baked: BakedTransfer) -> NDArray[np.float32]:
+        """(points, 3) that leaves an object's receivers, towards their normals where the view counts."""
+        return view_radiance(baked, self.light[name], baked.normals, self.direct[name])
+
+
+def read_all(scene: bpy.types.Scene, subject: str) -> dict[str, BakedTransfer]:
+    """The baked data of all objects by name. Raises where there is none, or where it is stale: never silently used."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    around = surroundings(depsgraph)
+    found: dict[str, BakedTransfer] = {}
+    for baked_object in baked_objects(scene):
+        transfer = read_baked(baked_object)
+        if transfer is None:
+            continue
+        why = stale(baked_object, depsgraph, around)
+        if why:
+            raise BadScene(baked_object.name, f"its bake is stale: {why}", "Bake it again")
+        found[baked_object.name] = transfer
+    if not found:
+        raise BadScene(subject, "no object in it is baked", "Bake it first with `prt bake`")
+    return found
+
+
+def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: Path | None = None,
+          rotate: float = 0.0, use_scene_lights: bool = True, window: bool = False) -> Lit:
+    """The light of the scene on its bakes; arguments as those of `light_coefficients`."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    order = max(b.lighting_basis.order for b in baked.values())
+    distant, warnings = None, []
+    if order:
+        found = light_coefficients(scene, depsgraph, order, environment, rotate, use_scene_lights, window,
+                                   all(b.cloud is None for b in baked.values()))
+        distant, warnings = found.coefficients, list(found.warnings)
+    scene_lamps = SceneLamps()
+    lamps = scene_lamps.step(baked, depsgraph, warnings) if use_scene_lights else []
+    local = {name: scene_lamps.cloud_light(b) if lamps else None for name, b in baked.items()}
+    return Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
+               {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()},
+               tuple(dict.fromkeys(warnings)))
