@@ -3,8 +3,8 @@
 
     python benchmarks/local_extremes.py [--docs]
 
-A closed room of 1 m, albedo 0.7 0.5 0.3, 64 lights asked for, compressed; and lit surfaces. Value: mean bounced radiance over the
-vertices for a lamp of 1 W/sr (unit albedo), divided by the lamp's intensity in W/sr; `direct`: so, of direct light.
+A closed room of 1 m, albedo 0.7 0.5 0.3, compressed: 64 lights asked for, or lit surfaces. Value: mean bounced radiance
+over the vertices (unit albedo), divided by the lamp's intensity in W/sr; `direct`: so, of direct light.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from tests.core.shapes import box, make
 UNIT = 4.0 * np.pi  # watts of a Point light of 1 W/sr
 SETTINGS = make_settings("standard", {"lighting": "local", "lamp_basis": "cloud", "cloud_lights": "64",
                                       "cloud_emission": "1", "zone_receivers": "300", "gather_directions": "512",
-                                      "clusters": "48", "vectors": "10", "error_receivers": "0", "spacing": "0.06", "threads": "1"})
+                                      "clusters": "48", "vectors": "10", "error_receivers": "0", "spacing": "0.06",
+                                      "threads": "1"})
 CENTRE = (0.4, 0.55, 0.5)
 
 
