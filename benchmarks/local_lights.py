@@ -168,9 +168,14 @@ def point_lamp(position: NDArray[np.float64]) -> LocalLight:
     return LocalLight("lamp", "point", matrix, np.full(3, POWER))
 
 
-def ours(kept: Kept, lamp: LampLight | SurfaceLamps, position: NDArray[np.float64], views: NDArray[np.float64] | None,
-         ) -> tuple[NDArray[np.float64], ...]:
-    """Indirect radiance (v, 3) by the cloud and by the compressed cloud: for unit albedo, or towards views (v, 3)."""
+def ours(kept: Kept, lamp: LampLight | SurfaceLamps, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Indirect radiance (v, 3), unit albedo: solved at the very position, by the columns, and by these compressed."""
+    return solved(kept, position), *of_columns(kept, lamp, position)
+
+
+def of_columns(kept: Kept, lamp: LampLight | SurfaceLamps, position: NDArray[np.float64],
+               views: NDArray[np.float64] | None = None) -> tuple[NDArray[np.float64], ...]:
+    """Indirect radiance (v, 3) by the columns and by these compressed: for unit albedo, or towards views (v, 3)."""
     baked = kept.baked
     light = joined_light(baked.lighting_basis, None, lamp.step([point_lamp(position)]).values)
     zone = baked.cluster_zone[baked.cluster]
@@ -245,7 +250,7 @@ def run(name: str, basis: str, arguments: argparse.Namespace) -> list:
     clear, found, started = surroundings(kept.solver.tracer, places).clearance, [], time.perf_counter()
     for number, (position, distance) in enumerate(zip(places, clear, strict=True)):
         source.location = position
-        cloud, drawn = (light[chosen] for light in ours(kept, lamp, position, views))
+        cloud, drawn = (light[chosen] for light in of_columns(kept, lamp, position, views))
         exact = towards[:, :, number] if views is not None else solved(kept, position)[chosen]
         first, second = (vertex_radiance(thing, passes, seed)[chosen] for seed in (0, 1))
         power = np.sum(first * second)
