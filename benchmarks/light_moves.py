@@ -29,7 +29,7 @@ from prt_addon.blender.read_scene import read_objects
 from prt_addon.lighting.light_cloud import box_matrix
 from prt_addon.lighting.local_lights import LocalLight
 from prt_addon.relighting.exit_radiance import cluster_constants
-from prt_addon.relighting.lamp_light import DirectLight, LampLight
+from prt_addon.relighting.lamp_light import DirectLight, lamps_in
 from prt_addon.relighting.scene_light import joined_light
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.tracing.tracer import Tracer
@@ -52,12 +52,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--spacing", type=float, default=0.0125)
     parser.add_argument("--lights", type=int, default=216)
+    parser.add_argument("--basis", choices=("surfaces", "cloud"), default="surfaces")
     arguments = parser.parse_args()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     thing, box = local_scenes.cornell()
     scene = SceneMesh.assemble(read_objects(bpy.context.evaluated_depsgraph_get(), [thing.name], []), arguments.spacing)
-    settings = make_settings("standard", {"lighting": "local", "cloud_lights": str(arguments.lights), "cloud_emission":
-                                          "1", "gather_directions": "64", "error_receivers": "0"})
+    settings = make_settings("standard", {"lighting": "local", "cloud_lights": str(arguments.lights),
+                                          "cloud_emission": "1", "lamp_basis": arguments.basis,
+                                          "gather_directions": "64", "error_receivers": "0"})
     baked = drain(bake(scene, settings, regions=np.array([box_matrix(*box)]))).objects[thing.name]
     tracer = Tracer(scene.points, scene.triangles, threads=1)  # as in Blender's own process
     package = types.ModuleType("prt")  # gpu_shaders imports the core relatively, as in the installed extension
@@ -67,16 +69,22 @@ def main() -> None:
 
     offscreen.prepare_gpu()
     print(f"{len(baked.cluster)} receivers, {baked.bases.shape[0]} clusters of at most {baked.bases.shape[1] - 1} "
-          f"vectors, {baked.cloud.zones} zones, at most {baked.cloud.columns} lights in each")
-    cloud, direct = LampLight(baked.cloud, tracer), DirectLight(tracer, baked)
+          f"vectors, {baked.cloud.zones} zones, at most {baked.cloud.columns} columns in each")
+    cloud, direct = lamps_in(baked.cloud, tracer), DirectLight(tracer, baked)
     transform = np.diag([0.4, 0.4, -0.4, 1.0])
     rows = []
     with offscreen._offscreen(*SIZE) as target:
         drawing = draw.ObjectDrawing(render_data.make_render_data(baked))
         for count in (1, 4, 16):
             some = lamps(count, box, count)
-            step, found = best_of(5, lambda some=some: cloud.step(some))
-            straight, values = best_of(5, lambda some=some: direct.of(some))
+
+
+            def moved(of, some=some):  # noqa: ANN001, ANN202
+                of([])  # forgets what it knows of lamps that stay
+                return of(some)
+
+            step, found = best_of(5, lambda: moved(cloud.step))
+            straight, values = best_of(5, lambda: moved(direct.of))
             light = joined_light(baked.lighting_basis, None, found.values)
             product, constants = best_of(5, lambda light=light: cluster_constants(baked.bases, light,
                                                                                    baked.cluster_zone))

@@ -16,6 +16,9 @@ from .subspaces import SPARE, Subspaces
 # of the time; the relative decrease of the squared error, in tolerances, below which a round was in vain, and after how
 # many of those in a row it ends; which look at all subspaces.
 ROUNDS, WIDE_ROUNDS, PATIENCE, MOST_IN_VAIN, SURVEY_EVERY = 12, 16, 0.05, 2, 6
+# Relative decrease of the squared error, by redistributing vectors once, from which on more rounds are tried: with points
+# that follow they come to five or ten times as much.
+WORTH = 0.004
 # Updates after vectors are added, so that power steps find the spectra that decide about them.
 SPECTRUM_STEPS = 2
 
@@ -53,7 +56,7 @@ def trim_vectors(gains: list[NDArray[np.float64]], counts: NDArray[np.int64], sc
 
 def adaptation_pays(errors: NDArray[np.float64], counts: NDArray[np.int64], gains: NDArray[np.float64],
                     vectors: int) -> bool:
-    """Whether redistributing vectors would lower the squared error by more than 2 %, from the spectra at hand.
+    """Whether redistributing vectors would lower the squared error by more than WORTH, from the spectra at hand.
 
     errors: (K,) with `vectors` vectors each; gains: (K, q) D_i^2 of more vectors than that.
     """
@@ -61,7 +64,7 @@ def adaptation_pays(errors: NDArray[np.float64], counts: NDArray[np.int64], gain
     most = np.arange(gains.shape[1])
     now = np.where(most < vectors, gains, 0.0).sum()
     then = np.where(most < used[:, None], gains, 0.0).sum()
-    return bool(then - now > 0.02 * errors.sum())
+    return bool(then - now > WORTH * errors.sum())
 
 
 def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monitor: Monitor) -> bool:

@@ -44,7 +44,7 @@ class Encoding:
     discarded: (clusters,) float64, each cluster's share of squared_error, the sum of its discarded D_i^2.
     history: (seconds, stage, squared error).
     adaptive_left_out: the adaptive method was asked for, but the clusters are so even that different numbers of vectors
-        would not have lowered the error by more than 2 %.
+        would hardly have lowered the error.
     """
 
     cluster: NDArray[np.int32]
