@@ -485,8 +485,8 @@ def lit_surfaces() -> Step:
     invoke("surface_patches=512, surface_columns=96, cloud_lights=27")
     yield from wait_for_bake()
     assert not session().failed, session().message
-    assert "lit surfaces" in session().cloud, session().cloud
     yield from check_picture("l31_surfaces")
+    assert "lit surfaces" in session().cloud, session().cloud
     for name, place in (("l32_at_wall", (-0.85, 0.0, 0.5)), ("l33_outside", (1.6, 0.0, 1.4))):
         lamp().location = place
         yield from check_picture(name)
