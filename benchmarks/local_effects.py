@@ -2,7 +2,7 @@
 """What zones, merging, rays between lights, fading, vectors and density do to a light cloud (Kristensen et al. 2005).
 Needs the bpy wheel for the scenes, no Cycles: every error is against our own solution at the very position of a lamp.
 
-    python benchmarks/cloud_effects.py [zones] [merging] [wall] [door] [vectors] [density] [--docs]
+    python benchmarks/local_effects.py [zones] [merging] [wall] [door] [vectors] [density] [--docs]
 
 Cornell's box with a cloud of 216 lights at most, lamps at 24 random places: `open`, more than 0.3 m from surfaces and
 within the box, where the cloud surrounds a lamp; `all` has those nearer, down to 0.1 m. Errors are relative RMS over
@@ -416,12 +416,12 @@ def main() -> None:
         table = markdown_table(header, rows)
         print(f"\n{name}\n{table}", flush=True)
         if arguments.docs:
-            write_block(ROOT / "docs" / "local_lights.md", f"cloud {name}", table)
+            write_block(ROOT / "docs" / "local_lights.md", f"local {name}", table)
             if name in PLOTS:
                 x_name, title, logarithmic, series = PLOTS[name]
                 lines = [Curve(label, [(float(row[0]), row[column] / 100.0) for row in rows])
                          for label, column in series]
-                save_plot(ROOT / "docs" / f"cloud_{name}.svg", curves(lines, x_name, "relative RMS of bounced light",
+                save_plot(ROOT / "docs" / f"local_{name}.svg", curves(lines, x_name, "relative RMS of bounced light",
                                                                       title, log_x=logarithmic))
 
 
