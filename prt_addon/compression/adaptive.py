@@ -16,8 +16,8 @@ from .subspaces import SPARE, Subspaces
 # of the time; the relative decrease of the squared error, in tolerances, below which a round was in vain, and after how
 # many of those in a row it ends; which look at all subspaces.
 ROUNDS, WIDE_ROUNDS, PATIENCE, MOST_IN_VAIN, SURVEY_EVERY = 12, 16, 0.05, 2, 6
-# Relative decrease of the squared error, by redistributing vectors once, from which on more rounds are tried: with points
-# that follow they come to five or ten times as much.
+# Relative decrease of the squared error, by redistributing vectors once, from which on more rounds are tried: with
+# points that follow they come to five or ten times as much.
 WORTH = 0.004
 # Updates after vectors are added, so that power steps find the spectra that decide about them.
 SPECTRUM_STEPS = 2

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..lighting.lit_surfaces import LitSurfaces, triangle_areas
 from ..lighting.local_lights import LocalLight
 from ..linear_algebra import multiply
+from ..scene.receivers import LIFT
 from ..tracing.tracer import Tracer
 from ..transport.near_light import linear_flux
 from .direct_light import LitReceivers, direct_local_light
@@ -22,6 +23,8 @@ Double = NDArray[np.float64]
 NEAR, FAR, CUTS = 4.0, 2.0, 6
 # Shadow rays from a triangle to a lamp that throws soft shadows: what has bounced shows none of their edges.
 SAMPLES = 4
+# A lamp nearer to a surface than this many LIFTs touches it.
+TOUCHING = 4.0
 
 
 class SurfaceLight:
@@ -63,6 +66,7 @@ class SurfaceLight:
 
     def flux(self, lamp: LocalLight) -> Double:
         """Flux over pi (s, 3) of a lamp of even colour to the thirds of the triangles."""
+        lamp = self._off_surfaces(lamp)
         value = direct_local_light(self._tracer, self._receivers, [lamp], SAMPLES)[:, 0].astype(np.float64)
         flux = np.repeat((value * self._area / 3.0)[:, None], 3, axis=1)
         reach = NEAR * self._size + lamp.extent
@@ -70,6 +74,24 @@ class SurfaceLight:
         if len(near):
             flux[near] = self._near(lamp, near)
         return flux
+
+    def _off_surfaces(self, lamp: LocalLight) -> LocalLight:
+        """A lamp that touches surfaces moved off them by what shadow rays leave out, so that it shines on them: half of
+        what it emits. In a corner off each of its walls; between the two sides of one, to the first."""
+        least = TOUCHING * LIFT * self._tracer.diagonal
+        position = lamp.position.copy()
+        away = position - self._middle
+        height = np.sum(away * self._normal, axis=1)
+        near = (np.abs(height) < least) & (np.sum(away ** 2, axis=1) < 4.0 * self._size ** 2)
+        moved = np.zeros(3)
+        for normal in self._normal[near]:
+            if abs(float(np.sum(moved * normal))) < 0.5 * least:
+                moved += least * normal
+        if not moved.any():
+            return lamp
+        matrix = lamp.matrix.copy()
+        matrix[:3, 3] = position + moved
+        return replace(lamp, matrix=matrix)
 
     def mean(self, flux: Double) -> Double:
         """Mean E / pi (patches,) of flux over pi (s, 3)."""

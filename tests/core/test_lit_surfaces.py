@@ -256,3 +256,15 @@ def test_broken_numbers_are_refused():
                    np.where(np.arange(len(flat)) == 18, 9.0, flat)):
         with pytest.raises(StorageError):
             read_cloud(header, broken, "Cube")
+
+
+@pytest.mark.parametrize("place", [(0.5, 0.5, 0.0), (0.37, 0.41, 1e-9), (0.0, 0.0, 0.0)])
+def test_a_lamp_that_touches_walls_shines_on_them(baked, place):
+    """As bright as a little off them: a touching lamp is no dark one."""
+    process, result = baked
+    container, tracer = result.objects["room"], process.tracer
+    touching = drawn(container, [lamp(place)], tracer).mean()
+    inward = np.where(np.array(place) < 0.2, 0.004, 0.0)
+    near = drawn(container, [lamp(place + inward)], tracer).mean()
+    # In a corner all its light falls within one vertex's reach.
+    assert touching == pytest.approx(near, rel=0.3 if not any(place) else 0.15)
