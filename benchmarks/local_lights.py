@@ -210,6 +210,7 @@ def milliseconds(kept: Kept, lamp: LampLight | SurfaceLamps, places: NDArray[np.
     baked, direct = kept.baked, DirectLight(kept.solver.tracer, kept.baked)
 
     def move(light: LocalLight) -> NDArray[np.float32]:
+        lamp.step([])  # forgets what it knows of a lamp that stays
         values = joined_light(baked.lighting_basis, None, lamp.step([light]).values)
         return cluster_constants(baked.bases, values, baked.cluster_zone)
 
@@ -217,7 +218,7 @@ def milliseconds(kept: Kept, lamp: LampLight | SurfaceLamps, places: NDArray[np.
     moved = [best_of(5, lambda light=light: move(light)) for light in lamps]
     drawn = [best_of(3, lambda c=constants: exit_radiance(baked.cluster, baked.weights, c))[0]
              for _, constants in moved]
-    lit = [best_of(3, lambda light=light: direct.of([light]))[0] for light in lamps]
+    lit = [best_of(3, lambda light=light: (direct.of([]), direct.of([light])))[0] for light in lamps]
     move_ms = 1e3 * float(np.mean([seconds for seconds, _ in moved]))
     return [move_ms, move_ms + 1e3 * float(np.mean(drawn) + np.mean(lit))]
 
