@@ -34,6 +34,8 @@ SECONDS_PER_SUBSURFACE_VALUE = 2e-6
 # Memory, fitted to the peaks of stages of bakes of 3,000 to 41,000 receivers, diffuse and metal, draft to high: it is
 # 1.2 to 1.8 times what they took; PROCESS, the interpreter and its libraries, is half of that here, more in Blender.
 PROCESS_BYTES, BYTES_PER_TRIANGLE = 200e6, 150
+# What arenas of threads and pages of mapped files add to bakes of local lights, more or less of it from run to run.
+LOOSE_LOCAL = 1.2
 # Of the operator, per hit of a gather ray: three entries; what glossy receivers remember of a hit; and lists of one
 # block while they are sorted into the operator.
 BYTES_PER_RAY_HIT, BYTES_PER_KEPT_HIT, BYTES_PER_SORTED_HIT = 24, 30, 75
@@ -189,7 +191,8 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
               known + transfer + rows + local.kept + max(local.zone, second + local.solving),
               _encoding(settings, shapes, rows + local.kept, transfer)]
     disk = operator + kept + visibility + 2 * transfer + rows + local.kept + local.responses
-    return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + max(stages)), int(disk)
+    loose = LOOSE_LOCAL if settings.local_light else 1.0
+    return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + loose * max(stages)), int(disk)
 
 
 @dataclass(frozen=True)

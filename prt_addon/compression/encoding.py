@@ -31,6 +31,8 @@ TRIALS_PER_START = 4
 # Values from which on random starts and sweeps among all subspaces beat splits (measured at 100 and 400).
 WIDE_VALUES = 64
 CHUNK = 4096
+# Clusters that a thread fits at a time.
+FITTED_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -184,10 +186,12 @@ def _finish(frame: GlobalFrame, state: Subspaces, enough: float | None, workers:
     used, labels, counts = np.unique(state.labels, return_inverse=True, return_counts=True)
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(counts)[:-1])
     vectors = state.vectors
-    fits = []
-    for cluster, points in zip(used, members, strict=True):
-        workers.tick()
-        fits.append(principal_components(frame.coordinates[points], int(vectors[cluster]), state.bases[cluster]))
+
+    def fitted(number: int) -> tuple[NDArray, NDArray, NDArray]:
+        cluster = used[number]
+        return principal_components(frame.coordinates[members[number]], int(vectors[cluster]), state.bases[cluster])
+
+    fits = workers.run_in_blocks(fitted, len(members), FITTED_TOGETHER)
     kept = np.array([len(fit[2]) for fit in fits])
     if enough is not None:
         scatter = np.array([_scatter_about(frame, points, fit[0]) for points, fit in zip(members, fits, strict=True)])
@@ -196,8 +200,9 @@ def _finish(frame: GlobalFrame, state: Subspaces, enough: float | None, workers:
     bases = np.zeros((len(fits), most + 1, values))
     weights = np.zeros((len(labels), most), np.float32)
     discarded = np.zeros(len(fits))
-    for cluster, (points, (mean, axes, _)) in enumerate(zip(members, fits, strict=True)):
-        workers.tick()
+
+    def weigh(cluster: int) -> None:
+        points, (mean, axes, _) = members[cluster], fits[cluster]
         axes = axes[:kept[cluster]]
         bases[cluster, 0], bases[cluster, 1:len(axes) + 1] = mean, axes
         for start in range(0, len(points), CHUNK):
@@ -205,6 +210,8 @@ def _finish(frame: GlobalFrame, state: Subspaces, enough: float | None, workers:
             centred = frame.coordinates[rows] - mean
             weights[rows, :len(axes)] = multiply(centred, axes.T)
             discarded[cluster] += np.square(centred - multiply(weights[rows, :len(axes)].astype(float), axes)).sum()
+
+    workers.run_in_blocks(weigh, len(members), FITTED_TOGETHER)
     original = multiply(bases.reshape(-1, values), frame.backward).reshape(*bases.shape[:2], -1)
     original[:, 0] += frame.mean
     discarded *= frame.scale**2

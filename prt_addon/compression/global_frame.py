@@ -105,12 +105,15 @@ def global_frame(signal: NDArray[np.floating], metric: NDArray | None = None, wo
     coordinates = np.empty((points, values), np.float32)
     seen, sums = np.zeros(values), np.zeros(values)
     single = np.ascontiguousarray(forward * scale, np.float32)
-    for start in range(0, points, CHUNK):
-        workers.tick()
+
+    def project(start: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         block = coordinates[start:start + CHUNK]
         multiply(_centred(signal[start:start + CHUNK], mean, scale), single, out=block)
-        seen += np.square(block).sum(axis=0, dtype=np.float64)
-        sums += block.sum(axis=0, dtype=np.float64)
+        return np.square(block).sum(axis=0, dtype=np.float64), block.sum(axis=0, dtype=np.float64)
+
+    for squares, values_sum in workers.run(project, range(0, points, CHUNK)):  # summed in order
+        seen += squares
+        sums += values_sum
     tail = np.append(np.cumsum(seen[::-1])[::-1], 0.0)
     offset = multiply(mean[None], forward)[0]
     energy = max(float(tail[0] + 2 * (offset * sums).sum() + points * (offset * offset).sum()), float(tail[0]) * 1e-3)

@@ -66,6 +66,12 @@ class Workers:
             wait(futures)
             raise
 
+    def run_in_blocks(self, work: Callable[[int], Result], count: int, block: int) -> list[Result]:
+        """The results of `work` on 0, 1, ... count - 1, so many in a row by one thread."""
+        parts = self.run(lambda start: [work(n) for n in range(start, min(start + block, count))],
+                         range(0, count, block))
+        return [result for part in parts for result in part]
+
     def _result(self, future: Future[Any]) -> Any:
         while not wait([future], INTERVAL).done:
             self.tick()
