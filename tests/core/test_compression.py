@@ -448,7 +448,7 @@ def test_a_cancel_is_answered_soon(method: str) -> None:
     signal = surface_signal(20000, 25)
     times = [time.process_time()]
     encode(signal, quick(64, 4, method), progress=lambda _: times.append(time.process_time()))
-    assert np.diff(times).max() < 0.5
+    assert np.diff(times).max() < 1.0  # of the processor: a cancel is answered within a second
 
 
 def test_distribution_keeps_to_the_budget_and_the_order() -> None:
