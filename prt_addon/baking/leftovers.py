@@ -15,10 +15,15 @@ RESPONSES = "responses-"
 HALF_WRITTEN = ".*.part"
 
 
-def drop_unfinished(folder: Path) -> None:
-    """Remove all that is of no use to a bake that resumes. Never raises: what can't be removed stays."""
+def drop_responses(folder: Path) -> None:
+    """Remove responses on disk. Never raises."""
     for left in folder.glob(f"{RESPONSES}*"):
         shutil.rmtree(left, ignore_errors=True)
+
+
+def drop_unfinished(folder: Path) -> None:
+    """Remove all that is of no use to a bake that resumes. Never raises: what can't be removed stays."""
+    drop_responses(folder)
     for left in folder.glob(HALF_WRITTEN):
         try:
             left.unlink(missing_ok=True)

@@ -7,7 +7,6 @@ they go to disk as they are made, one file per zone, and one zone at a time come
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +34,7 @@ from ..transport.gather import Gather
 from ..transport.glossy import reflected_light
 from ..transport.incident_light import DiffuseRadiance, IndirectLight
 from ..transport.local_lights import LightSolver
-from .leftovers import RESPONSES
+from .leftovers import RESPONSES, drop_responses
 from .lit_highlights import LitHighlights
 from .local_budget import Probes, probe_positions
 from .settings import BakeSettings
@@ -87,6 +86,8 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
     regions: (b, 4, 4) boxes of the lights, none for the scene's free space; folder: where large files may lie;
     highlights: of receivers whose hits the gather kept. Raises BadScene where no light fits.
     """
+    if folder is not None:
+        drop_responses(folder)  # of a bake of this job that was killed
     lights = _placed(tracer, scene, regions, settings)
     if settings.lamp_basis == "surfaces":
         return (yield from _by_surfaces(tracer, scene, gathered, albedo, keys, lights, settings, folder, highlights))
@@ -103,8 +104,6 @@ def local_transfer(tracer: Tracer, scene: SceneMesh, gathered: Gather | None, al
                          settings.cloud_radius)
     solved, merging = (SOLVED, MERGED) if highlights is None else (0.5 * SOLVED, 0.5 * MERGED)
     values = order ** 2 * albedo.shape[1]
-    for left in folder.glob(f"{RESPONSES}*") if folder else ():  # by a bake of this job that was killed
-        shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=RESPONSES) as place:
         store = _Responses(Path(place), members, gathered, len(lights), values)
         yield from _part(solver.solve(lights.positions, store.take), 0.0, solved)

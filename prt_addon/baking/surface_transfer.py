@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lighting.light_visibility import surroundings
-from ..lighting.lit_surfaces import LitSurfaces, lit_elements, make_patches
+from ..lighting.lit_surfaces import LitSurfaces, lit_elements, make_patches, triangle_areas
 from ..lighting.local_lights import LocalLight
 from ..linear_algebra import multiply, symmetric_eigenpairs
 from ..relighting.lamp_light import unit_lamp
@@ -30,6 +30,7 @@ from ..transport.gather import Gather
 from ..transport.glossy import reflected_light
 from ..transport.incident_light import DiffuseRadiance, IndirectLight
 from ..transport.local_lights import LightSolver
+from .leftovers import RESPONSES
 from .lit_highlights import LitHighlights
 
 Single = NDArray[np.float32]
@@ -81,7 +82,7 @@ def surface_columns(tracer: Tracer, scene: SceneMesh, solver: LightSolver, rows:
         lit[:, number], lit[:, len(lamps) + number] = light.mean(flux), light.mean(light.aimed(flux, spot))
         yield LEARNT * (number + 1) / len(lamps)
     channels = solver.albedo.shape[1]
-    with tempfile.TemporaryDirectory(dir=folder, prefix="responses-") as place:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=RESPONSES) as place:
         responses = np.lib.format.open_memmap(Path(place) / "patches.npy", "w+", np.float32,
                                               (count, len(rows) * channels))
         learnt = np.zeros((lit.shape[1], len(rows) * channels), np.float32)
@@ -172,9 +173,7 @@ def _surfaces(tracer: Tracer, scene: SceneMesh, gathered: Gather, most: int, see
     row = np.full(2 * count, -1, np.int64)
     row[key] = np.arange(len(key))
     corners = scene.points[scene.triangles]
-    edges = corners[:, 1:] - corners[:, :1]
-    area = 0.5 * np.sqrt(np.sum(np.cross(edges[:, 0], edges[:, 1]) ** 2, axis=1))
-    own = np.bincount(scene.triangles.ravel(), np.repeat(area / 3.0, 3), count)[key % count]
+    own = np.bincount(scene.triangles.ravel(), np.repeat(triangle_areas(corners) / 3.0, 3), count)[key % count]
     receivers = gathered.receivers
     # Where rays start is pulled into the receiver's own faces: two floors that meet under a wall are told apart.
     places, normals = receivers.origins.astype(np.float64), receivers.normals.astype(np.float64)

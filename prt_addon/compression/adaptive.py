@@ -16,9 +16,9 @@ from .subspaces import SPARE, Subspaces
 # of the time; the relative decrease of the squared error, in tolerances, below which a round was in vain, and after how
 # many of those in a row it ends; which look at all subspaces.
 ROUNDS, WIDE_ROUNDS, PATIENCE, MOST_IN_VAIN, SURVEY_EVERY = 12, 16, 0.05, 2, 6
-# Relative decrease of the squared error, by redistributing vectors once, from which on more rounds are tried: with
-# points that follow they come to five or ten times as much.
-WORTH = 0.004
+# Relative decrease of the squared error for which it is worth while: foretold by the spectra or, as points that follow
+# their prices often gain ten times as much, shown by the first rounds TRIED.
+WORTH, TRIED = 0.02, 4
 # Updates after vectors are added, so that power steps find the spectra that decide about them.
 SPECTRUM_STEPS = 2
 
@@ -36,8 +36,18 @@ def distribute(gains: NDArray[np.float64], counts: NDArray[np.int64], budget: in
     worth = (gains.reshape(-1)[order] > 0) & (costs > 0)
     cluster, costs = cluster[worth], costs[worth]
     affordable = np.cumsum(costs) <= budget
-    # The first vector that no longer fits ends the list: taking later, cheaper ones would break the order.
-    return np.bincount(cluster[affordable], minlength=clusters)
+    used = np.bincount(cluster[affordable], minlength=clusters)
+    # What is left may buy vectors of smaller clusters; a cluster that can't pay for its next one gets no later one.
+    left, closed = budget - int(costs[affordable].sum()), np.zeros(clusters, bool)
+    for number, cost in zip(cluster[~affordable], costs[~affordable], strict=True):
+        if left < counts[counts > 0].min():
+            break
+        if cost > left or closed[number]:
+            closed[number] = True
+        else:
+            used[number] += 1
+            left -= int(cost)
+    return used
 
 
 def trim_vectors(gains: list[NDArray[np.float64]], counts: NDArray[np.int64], scatter: NDArray[np.float64],
@@ -73,8 +83,8 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
 
     Points go where squared error and weights together cost least, at the price for which the last vector was bought.
     By the error alone, clusters of many vectors fill up with points for which few would do, and the vectors that this
-    costs them are missed elsewhere (measured: 2 to 5 % more error). Returns False, with nothing changed, where
-    the clusters' spectra say that it would not pay. Keeps the best state.
+    costs them are missed elsewhere (measured: 2 to 5 % more error). Keeps the best state. Returns False, with points
+    and vectors as they were, where neither the clusters' spectra nor the first rounds say that it pays.
     """
     most = settings.most_vectors
     budget = len(state.labels) * settings.vectors
@@ -83,10 +93,8 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
     state.resize(width, most + SPARE)
     for _ in range(SPECTRUM_STEPS):
         error = work.fit(state, width)
-    best = error, state.labels, state.vectors
-    if not adaptation_pays(state.errors, state.counts, state.spread[:, :most], settings.vectors):
-        monitor.note("adaptive left out", error, 1.0)
-        return False
+    best = even = error, state.labels, state.vectors
+    pays = adaptation_pays(state.errors, state.counts, state.spread[:, :most], settings.vectors)
     in_vain = 0
     rounds = WIDE_ROUNDS if width < frame.coordinates.shape[1] else ROUNDS
     for number in range(rounds):
@@ -97,14 +105,18 @@ def adapt(frame: GlobalFrame, state: Subspaces, settings: EncoderSettings, monit
         if error < last:
             best = error, state.labels, state.vectors
         # Clusters of many vectors keep few points, for which more vectors are cheap: a round may raise it.
+        pays |= best[0] < (1.0 - WORTH) * even[0]
         in_vain = in_vain + 1 if error > last * (1 - PATIENCE * settings.tolerance) else 0
-        if in_vain == MOST_IN_VAIN:
+        if in_vain == MOST_IN_VAIN or (number + 1 >= TRIED and not pays):
             break
         if number < rounds - 1:
             state.price = _price(state)
             work.sweep(state, error, number % SURVEY_EVERY == 0)
+    if not pays:
+        monitor.note("adaptive left out", even[0], 1.0)
+        best = even
     state.labels, state.vectors, state.price = best[1], best[2], 0.0
-    return True
+    return pays
 
 
 def _price(state: Subspaces) -> float:

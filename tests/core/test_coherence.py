@@ -43,7 +43,7 @@ def surface_signal(cells: int, rows: int, columns: int, seed: int) -> NDArray[np
     line = np.linspace(0, 1, cells + 1)
     place = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
     waves = np.sin(place @ generator.normal(0, 6, (2, rows * columns)) + generator.uniform(0, 6, rows * columns))
-    return (waves + 1.0 * place[:, :1] ** 8 * generator.normal(size=waves.shape)).astype(np.float32)
+    return (waves + 0.6 * place[:, :1] ** 8 * generator.normal(size=waves.shape)).astype(np.float32)
 
 
 CELLS, METRIC = 40, np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.2], [0.0, 0.2, 0.1]])

@@ -189,7 +189,13 @@ def test_not_worse_than_the_papers_procedure(case: tuple[int, int, int, int, int
     assert ours <= 1.02 * min(papers_procedure(signal, clusters, vectors, trial, 10) for trial in range(5))
 
 
-def test_quick_sweeps_lower_the_error_and_end_where_no_nearer_subspace_is() -> None:
+@pytest.mark.parametrize(("leverage", "rises", "nearest"), [(0.0, 1e-5, 0.95), (None, 0.01, 0.9)])
+def test_quick_sweeps_lower_the_error_and_end_where_no_nearer_subspace_is(
+        leverage: float | None, rises: float, nearest: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By plain distances the error never rises. Where subspaces are to follow, many points move at once, so that a
+    sweep may raise it a little."""
+    if leverage is not None:
+        monkeypatch.setattr(neighbours_module, "MOST_LEVERAGE", leverage)
     signal = surface_signal(6000, 12)
     state = from_labels(np.random.default_rng(1).integers(0, 60, 6000).astype(np.int32), 60, 12, 2)
     neighbours = Neighbours(60)
@@ -200,11 +206,12 @@ def test_quick_sweeps_lower_the_error_and_end_where_no_nearer_subspace_is() -> N
         assert sweep.changed == (before != state.labels).sum()
         neighbours.learn(before, state.labels, sweep.runner_up)
         errors.append(update(signal, state))
-    # Many points move at once, so that a sweep may raise the error a little.
-    assert all(after <= before * 1.01 for before, after in itertools.pairwise(errors)) and errors[-1] < 0.4 * errors[0]
+    assert all(after <= before * (1 + rises) for before, after in itertools.pairwise(errors))
+    assert errors[-1] < 0.4 * errors[0]
     squared = brute_squared_distances(signal, list(state.means), list(state.bases[:, :2]))
+    reclassify_near(signal, state, neighbours.lists(state))
     own = squared[np.arange(6000), state.labels]
-    assert (own <= squared.min(axis=1) * (1 + 1e-3) + 1e-6).mean() > 0.9
+    assert (own <= squared.min(axis=1) * (1 + 1e-3) + 1e-6).mean() > nearest
 
 
 def error_of(points: NDArray, vectors: int) -> float:
@@ -448,7 +455,7 @@ def test_a_cancel_is_answered_soon(method: str) -> None:
     signal = surface_signal(20000, 25)
     times = [time.process_time()]
     encode(signal, quick(64, 4, method), progress=lambda _: times.append(time.process_time()))
-    assert np.diff(times).max() < 1.0  # of the processor: a cancel is answered within a second
+    assert np.diff(times).max() < 0.5
 
 
 def test_distribution_keeps_to_the_budget_and_the_order() -> None:

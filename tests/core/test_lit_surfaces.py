@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from prt_addon.baking.job import read_result, run_job, write_job
+from prt_addon.baking.job import write_job
 from prt_addon.baking.recipe import _Bake, bake, exhaust, transport_settings
 from prt_addon.baking.settings import BakeSettings
 from prt_addon.errors import StorageError
@@ -24,7 +24,7 @@ from prt_addon.storage.container import flatten_cloud, read_cloud
 from prt_addon.tracing.tracer import Tracer
 from prt_addon.transport.local_lights import LightSolver
 from tests.core.shapes import box, make
-from tests.core.test_local_bakes import LOCAL, lamp, room
+from tests.core.test_local_bakes import LOCAL, lamp, room, stopped_and_resumed
 
 SURFACES = replace(LOCAL, lamp_basis="surfaces", surface_patches=600, surface_columns=256, cloud_lights=48)
 
@@ -210,19 +210,8 @@ def test_the_report_tells_of_the_surfaces_and_of_the_error(baked):
 
 def test_a_job_resumes_and_stored_surfaces_are_the_same(tmp_path):
     settings = replace(SURFACES, error_receivers=0, cloud_lights=12, surface_patches=120, surface_columns=40)
-    folder = write_job(tmp_path, room(), settings)
-    steps = run_job(folder)
-    for progress in steps:
-        if progress.stage == "encode":
-            steps.close()
-            break
-    assert (folder / "local.npz").exists() and not list(folder.glob("responses-*"))
-    for _ in run_job(folder):
-        pass
-    stored = read_result(folder)
-    assert "local" in stored.report["resumed"]
+    found = stopped_and_resumed(write_job(tmp_path, room(), settings))
     direct = exhaust(bake(room(), settings)).objects["room"]
-    found = stored.objects["room"]
     assert np.array_equal(found.bases, direct.bases) and np.array_equal(found.cloud.axes, direct.cloud.axes)
     assert np.array_equal(found.cloud.corners, direct.cloud.corners)
     assert np.array_equal(found.cloud.patch, direct.cloud.patch)

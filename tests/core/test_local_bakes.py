@@ -196,11 +196,9 @@ def test_the_light_of_a_lamp_hardly_changes_whatever_merges():
     assert max(means) < 1.1 * min(means), means
 
 
-def test_a_job_resumes_and_its_result_is_the_same(tmp_path):
-    settings = BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0, "cloud_lights": 27})
-    regions = np.array([box_matrix((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))])
-    folder = write_job(tmp_path, room(), settings, regions=regions)
-    (folder / "responses-killed").mkdir()  # as a bake that was killed leaves it
+def stopped_and_resumed(folder):
+    """The result of a job in which a killed bake left responses, stopped after its lamps' stage and run again."""
+    (folder / "responses-killed").mkdir()
     (folder / "responses-killed" / "zone_0.npy").write_bytes(b"much")
     steps = run_job(folder)
     for progress in steps:
@@ -212,8 +210,15 @@ def test_a_job_resumes_and_its_result_is_the_same(tmp_path):
         pass
     stored = read_result(folder)
     assert "local" in stored.report["resumed"]
+    return stored.objects["room"]
+
+
+def test_a_job_resumes_and_its_result_is_the_same(tmp_path):
+    settings = BakeSettings(**{**LOCAL.as_dict(), "error_receivers": 0, "cloud_lights": 27})
+    regions = np.array([box_matrix((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))])
+    folder = write_job(tmp_path, room(), settings, regions=regions)
+    found = stopped_and_resumed(folder)
     direct = exhaust(bake(room(), settings, regions=regions)).objects["room"]
-    found = stored.objects["room"]
     assert np.array_equal(found.bases, direct.bases) and np.array_equal(found.cloud.positions, direct.cloud.positions)
     assert np.array_equal(found.cloud.dense, direct.cloud.dense) and found.cloud.spacing == direct.cloud.spacing
 
