@@ -12,8 +12,10 @@ from .operators.clear import PRT_OT_clear
 from .operators.job_mixin import JobMixin
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
+from .panels.bake import PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights
 from .panels.lamp import PRT_PT_lamp
-from .panels.sidebar import PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_preview, PRT_PT_results
+from .panels.preview import PRT_PT_preview
+from .panels.results import PRT_PT_results
 
 CLASSES = (
     properties.PRTSettings,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from .sidebar import wrapped
+from .layout import wrapped
 
 
 class PRT_PT_lamp(bpy.types.Panel):

@@ -27,7 +27,10 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 UI_SECONDS = 600
 # What drives an interface, and what makes its scene.
-SCRIPTS = {"interface": ("in_blender.py", "make_scene.py"), "lamps": ("lamps_in_blender.py", "make_room.py")}
+SCRIPTS = {
+    "interface": ("in_blender.py", "make_scene.py"),
+    "lamps": ("lamps_in_blender.py", "make_room.py"),
+}
 COMMAND_SECONDS = 240
 
 

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""In the sidebar: the viewport's picture under the present light."""
+
+from __future__ import annotations
+
+import bpy
+
+from .layout import Sidebar, wrapped
+
+
+class PRT_PT_preview(Sidebar, bpy.types.Panel):
+    """The viewport's picture under the present light."""
+
+    bl_idname = "PRT_PT_preview"
+    bl_label = "Preview"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, session = self.layout, context.window_manager.prt
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.operator("prt.toggle_preview", text="Relight in Viewport", icon="SHADING_RENDERED",
+                        depress=session.preview)
+        column = layout.column()
+        column.active = session.preview
+        column.prop(context.scene.prt, "exposure")
+        column.prop(context.scene.prt, "window")
+        for line in session.preview_message.splitlines():
+            wrapped(layout, context, line, "ERROR" if "outside the light cloud" in line else "INFO")
+        for line in session.viewport_message.splitlines():
+            wrapped(layout, context, line, "INFO")
+        layout.operator("prt.relight", icon="GROUP_VCOL")

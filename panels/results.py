@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""In the sidebar: what came out of the bakes."""
+
+from __future__ import annotations
+
+import bpy
+
+from .layout import Sidebar, plural, wrapped
+
+ROWS = 20  # of results: more make the sidebar slow and nobody reads them
+
+
+class PRT_PT_results(Sidebar, bpy.types.Panel):
+    """Baked objects, with a warning where one was edited since."""
+
+    bl_idname = "PRT_PT_results"
+    bl_label = "Baked Objects"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, session = self.layout, context.window_manager.prt
+        if not session.objects:
+            layout.label(text="Nothing is baked yet", icon="INFO")
+            return
+        if session.cloud:
+            box = layout.box().column(align=True)
+            for number, line in enumerate(session.cloud.splitlines()):
+                box.label(text=line, icon="BLANK1" if number else "LIGHT")
+        column = layout.box().column(align=True)
+        for line in session.objects[:ROWS]:
+            row = column.row()
+            row.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
+            row.label(text=plural(line.points, "receiver") if line.points else "not readable")
+            for details in _details(line):
+                column.label(text=details, icon="BLANK1")
+            if line.stale:
+                wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
+        if len(session.objects) > ROWS:
+            column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
+        layout.operator("prt.clear", icon="TRASH")
+
+
+def _details(line: bpy.types.PropertyGroup) -> list[str]:
+    """What came out for one object, in short lines."""
+    lines = [plural(line.clusters, "cluster")] * bool(line.clusters)
+    errors = ((line.error, "diffuse"), (line.highlight_error, "highlight"), (line.lamp_error, "lamps'"),
+              (line.lamp_highlight_error, "lamps' highlight"))
+    lines += [f"{part} error {100.0 * value:.2f} %" for value, part in errors if value >= 0.0]
+    if line.overdraw > 0.0:
+        lines.append(f"overdraw {line.overdraw_before:.2f} to {line.overdraw:.2f}")
+        lines.append(f"for {100.0 * line.error_spent:.1f} % of squared error")
+    return lines
