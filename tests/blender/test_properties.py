@@ -136,7 +136,8 @@ class Drawn:
 
 @pytest.mark.parametrize(("lighting", "basis"), [("environment", None), ("local", "cloud"), ("both", "surfaces")])
 def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: bpy.types.PropertyGroup) -> None:
-    from prt.panels import sidebar
+    from prt.panels.bake import PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights
+    from prt.panels.preview import PRT_PT_preview
 
     settings.lighting = lighting
     if basis is not None:
@@ -145,7 +146,7 @@ def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: b
     context = types.SimpleNamespace(scene=bpy.context.scene, window_manager=bpy.context.window_manager,
                                     selected_objects=[], preferences=bpy.context.preferences,
                                     region=types.SimpleNamespace(width=300))
-    for panel in (sidebar.PRT_PT_bake, sidebar.PRT_PT_highlights, sidebar.PRT_PT_local_lights, sidebar.PRT_PT_preview):
+    for panel in (PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_preview):
         if "poll" not in vars(panel) or panel.poll(context):
             drawing = types.SimpleNamespace(layout=Drawn(found))
             drawing.column = lambda context, panel=panel, drawing=drawing: panel.column(drawing, context)
