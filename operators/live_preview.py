@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from ..gpu_shaders import viewport
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
-from ..prt_addon.basis.spherical_harmonics import rotate
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
+from ..prt_addon.lighting.distant_light import DistantLight
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.scene_light import joined_light
+from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
@@ -54,7 +55,7 @@ class Live:
     """Everything that the handlers share."""
 
     shown: dict[str, Shown] = field(default_factory=dict)
-    light: NDArray[np.float64] | None = None
+    light: DistantLight | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
@@ -117,7 +118,8 @@ def draw_list() -> list[DrawItem]:
         if found is None or found.mode != "OBJECT" or not found.visible_in_viewport_get(space):
             continue
         moved = transform_since_bake(found, shown.baked.header)
-        light = joined_light(shown.baked.lighting_basis, _light_in(moved), _live.lamps.cloud_light(shown.baked))
+        basis = shown.baked.lighting_basis
+        light = joined_light(basis, _light_in(basis, moved), _live.lamps.cloud_light(shown.baked))
         items.append(DrawItem(shown.key, shown.baked, moved, light, exposure, shown.stale, direct=shown.direct))
     return items
 
@@ -137,17 +139,17 @@ def labels() -> list[tuple[str, tuple[float, ...]]]:
     return [(OUTSIDE_LABEL, tuple(lamp.position)) for lamp in _live.lamps_read if lamp.name in outside]
 
 
-def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _light_in(basis: Columns, moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Distant light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
     if _live.light is None:
         return None
     scale = np.sqrt((moved[:3, :3] ** 2).sum(axis=0))
     turn = moved[:3, :3] / np.where(scale > 0.0, scale, 1.0)
     if np.abs(turn - np.eye(3)).max() < 1e-5 or np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:  # small
-        return _live.light  # not turned, or sheared: then the bake is stale anyway
-    key = turn.round(6).tobytes()
+        return _live.light.in_columns(basis)  # not turned, or sheared: then the bake is stale anyway
+    key = (basis.cubemap, turn.round(6).tobytes())
     if key not in _live.rotated:
-        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: rotate(_live.light, turn.T)}
+        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: _live.light.in_columns(basis, turn.T)}
     return _live.rotated[key]
 
 
@@ -236,20 +238,15 @@ def _read_light() -> None:
         _live.signature = _live.light = None
         return
     started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
-    warnings: list[str] = []
-    order = max(shown.baked.lighting_basis.order for shown in _live.shown.values())
-    distant, signature = None, None
-    if order:
-        name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
-        found = light_coefficients(bpy.context.scene, depsgraph, order, window=bpy.context.scene.prt.window,
-                                   name_lamps=name_lamps)
-        distant, signature = found.coefficients, found.signature
-        warnings += found.warnings
+    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
+    distant, warnings, signature = distant_light(
+        bpy.context.scene, depsgraph, (shown.baked.lighting_basis for shown in _live.shown.values()),
+        window=bpy.context.scene.prt.window, name_lamps=name_lamps)
     _read_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
     assign(session(), preview_message="\n".join(dict.fromkeys(warnings)))
-    if (order, signature) != _live.signature:
-        _live.signature, _live.light, _live.rotated = (order, signature), distant, {}
+    if signature != _live.signature:
+        _live.signature, _live.light, _live.rotated = signature, distant, {}
         viewport.redraw()
 
 

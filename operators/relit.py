@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import BadScene
 from ..prt_addon.relighting.exit_radiance import view_radiance
@@ -56,15 +56,13 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
           rotate: float = 0.0, use_scene_lights: bool = True, window: bool = False) -> Lit:
     """The light of the scene on its bakes; arguments as those of `light_coefficients`."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    order = max(b.lighting_basis.order for b in baked.values())
-    distant, warnings = None, []
-    if order:
-        found = light_coefficients(scene, depsgraph, order, environment, rotate, use_scene_lights, window,
-                                   all(b.cloud is None for b in baked.values()))
-        distant, warnings = found.coefficients, list(found.warnings)
+    bases = {name: b.lighting_basis for name, b in baked.items()}
+    name_lamps = all(b.cloud is None for b in baked.values())
+    distant, warnings, _ = distant_light(scene, depsgraph, bases.values(), environment, rotate, use_scene_lights,
+                                         window, name_lamps)
     scene_lamps = SceneLamps()
     lamps = scene_lamps.step(baked, depsgraph, warnings) if use_scene_lights else []
     local = {name: scene_lamps.cloud_light(b) if lamps else None for name, b in baked.items()}
-    return Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
+    return Lit({name: joined_light(basis, distant.in_columns(basis), local[name]) for name, basis in bases.items()},
                {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()},
                tuple(dict.fromkeys(warnings)))
