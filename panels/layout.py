@@ -19,9 +19,9 @@ class Sidebar:
     bl_category = "PRT"
 
 
-def plural(count: int, what: str) -> str:
-    """"1 face", "1,200 faces"."""
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
+def plural(count: int, what: str, several: str = "") -> str:
+    """"1 face", "1,200 faces"; several: where more of it are called otherwise than with an s."""
+    return f"{count:,} {what if count == 1 else several or what + 's'}"
 
 
 def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE",
