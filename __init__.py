@@ -15,6 +15,7 @@ from .operators.relight import PRT_OT_relight
 from .panels.bake import PRT_PT_bake
 from .panels.lamp import PRT_PT_lamp
 from .panels.preview import PRT_PT_preview
+from .panels.properties_editor import PRT_PT_object, PRT_PT_world
 from .panels.results import PRT_PT_results
 from .panels.settings import PRT_PT_compression, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_rays
 
@@ -36,6 +37,8 @@ CLASSES = (
     PRT_PT_preview,
     PRT_PT_results,
     PRT_PT_lamp,
+    PRT_PT_object,
+    PRT_PT_world,
 )
 
 

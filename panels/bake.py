@@ -8,6 +8,7 @@ import bpy
 from .layout import Sidebar, plural, wrapped
 
 NAMES = 3  # of objects that are told
+TOLD_AS = {"Left out:": "REMOVE", "Bake:": "ERROR"}  # icons of an analysis' lines by how they start
 
 
 class PRT_PT_bake(Sidebar, bpy.types.Panel):
@@ -50,8 +51,9 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
             wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
         if session.analysis:
             box = layout.box()
-            for line in session.analysis.splitlines():
-                wrapped(box, context, line)
+            for number, line in enumerate(session.analysis.splitlines()):
+                icon = next((i for start, i in TOLD_AS.items() if line.startswith(start)), "INFO")
+                wrapped(box, context, line[0].upper() + line[1:], "TIME" if number == 0 else icon)
 
 
 def _what_is_baked(context: bpy.types.Context) -> list[tuple[str, str]]:
