@@ -161,7 +161,7 @@ def measure_bounces(name: str, ground: bool, options: argparse.Namespace) -> lis
     case = case_of(name, ground, 0)
     gathered = drain(gather_operator(case.tracer, case.scene, case.keys, *quadrature(128, 4)))
     budget = int(options.budget * 1e9)
-    direct = drain(cubemap_transfer(case.tracer, gathered.receivers, options.size, 0, budget=budget))
+    direct = drain(cubemap_transfer(case.tracer, gathered.receivers, options.size, 1, budget=budget))
     albedo = np.full((len(gathered.receivers), 1), 0.7, np.float32)
     started = time.perf_counter()
     exact, _ = drain(bounced_columns(gathered.matrix, albedo, direct, 1e-3, budget=budget))

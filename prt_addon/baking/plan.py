@@ -26,7 +26,7 @@ SHADOW_RAYS_PER_SECOND = 3.5e6
 GATHER_RAYS_PER_SECOND = 1.2e6
 PATH_RAYS_PER_SECOND = 0.8e6
 SECONDS_PER_BOUNCED_VALUE = 2e-8
-SECONDS_PER_ENCODED_VALUE = 1.2e-8
+SECONDS_PER_ENCODED_VALUE, SECONDS_PER_PROJECTED_VALUE = 1.2e-8, 5e-10
 SECONDS_PER_GLOSSY_VALUE = 1e-7
 SECONDS_PER_LOCAL_VALUE = 2e-7
 # Of highlights of local light, for each value of their rows: filled, and encoded (many more values for each receiver
@@ -118,7 +118,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
             seconds["local"] = 2.0 * seconds["local"] + wide * SECONDS_PER_LOCAL_ROW
     if translucent:
         seconds["subsurface"] = 0.2 + translucent * columns * needs.channels * SECONDS_PER_SUBSURFACE_VALUE
-    seconds["encode"] = (0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
+    per_value = SECONDS_PER_PROJECTED_VALUE if settings.encoder == EIGENTRANSPORT else SECONDS_PER_ENCODED_VALUE
+    seconds["encode"] = (0.2 + values * max(1, settings.vectors) * per_value
                          + wide * SECONDS_PER_WIDE_VALUE)
     if settings.error_receivers:
         # Diffuse light and highlights are measured apart, each with paths of about two rays.
