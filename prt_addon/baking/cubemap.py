@@ -17,7 +17,7 @@ from scipy import sparse
 
 from ..compression.encoding import Encoding
 from ..tracing.tracer import Tracer
-from ..transport.column_arrays import column_array, column_blocks
+from ..transport.column_arrays import COLUMNS_AT_ONCE, column_array, column_blocks
 from ..transport.cubemap_transfer import bounced_columns, cubemap_transfer
 from ..transport.interreflection import Interreflection
 from ..transport.receiver_set import ReceiverSet
@@ -25,6 +25,10 @@ from .distant_basis import DistantBasis, array_budget
 from .settings import BakeSettings
 
 Single = NDArray[np.float32]
+
+# Copies of a block of columns while it is bounced, which take part of the budget too, and columns below which blocks
+# are no more than a loop.
+COPIES_OF_BLOCK, FEWEST_COLUMNS = 6, 16
 
 def is_kept(transfer: Single, settings: BakeSettings) -> bool:
     """Whether a finished stage of such an array is written to the job folder: one beyond the budget is not, since it
@@ -44,8 +48,11 @@ def direct_cubemap(tracer: Tracer, receivers: ReceiverSet, basis: DistantBasis, 
 def bounced_cubemap(matrix: sparse.csr_matrix, albedo: Single, direct: Single, settings: BakeSettings,
                     folder: Path | None) -> Generator[float, None, Interreflection]:
     """Yield progress, return direct (r, columns) with all bounces: a transfer (r, columns, channels)."""
+    budget, column = array_budget(settings), 4 * direct.shape[0] * albedo.shape[1]
+    at_once = COLUMNS_AT_ONCE if budget is None else budget // (COPIES_OF_BLOCK * column)
+    at_once = int(np.clip(at_once, FEWEST_COLUMNS, COLUMNS_AT_ONCE))
     found, solved = yield from bounced_columns(matrix, albedo, direct.T, settings.bounce_error, settings.bounces,
-                                               array_budget(settings), folder)
+                                               budget, folder, at_once)
     return replace(solved, transfer=_by_receiver(found, albedo.shape[1]))
 
 

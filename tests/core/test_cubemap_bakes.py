@@ -83,11 +83,12 @@ def test_clustered_encoders_take_the_same_columns(baked, encoder):
         assert np.sqrt(np.mean(difference ** 2) / np.mean(diffuse_radiance(other, light) ** 2)) < 0.04
 
 
-def test_a_small_memory_budget_changes_nothing_and_leaves_no_file(baked, tmp_path):
-    settings = replace(SMALL, memory_budget=1e-6, error_receivers=0)
-    found = exhaust(bake(still_life(), settings, tmp_path, light=sunny()))
-    for name, container in found.objects.items():
-        other = baked.objects[name]
+def test_a_small_memory_budget_changes_nothing_and_leaves_no_file(tmp_path):
+    settings = replace(SMALL, error_receivers=0, bounces=3)  # the Krylov solver stops where its block is done
+    small = exhaust(bake(still_life(), replace(settings, memory_budget=1e-6), tmp_path, light=sunny()))
+    large = exhaust(bake(still_life(), settings, light=sunny()))
+    for name, container in small.objects.items():
+        other = large.objects[name]
         assert np.array_equal(container.weights, other.weights) and np.array_equal(container.bases, other.bases)
     assert {path.name for path in tmp_path.iterdir()} == {"gather.npz"}
 
