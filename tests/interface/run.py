@@ -54,7 +54,7 @@ class Blender:
 
     def script(self, name: str, *arguments: str) -> None:
         """Run a script with the interface; its output lands in the output folder."""
-        with open(self.output / f"{name}.log", "w", encoding="utf-8") as log:
+        with open(self.output / f"{Path(name).name}.log", "w", encoding="utf-8") as log:
             subprocess.run([*self.ui, "--python-exit-code", "1", "--python", str(HERE / name), "--", *arguments],
                            env=self.environment, stdout=log, stderr=subprocess.STDOUT, timeout=UI_SECONDS, check=False)
 
