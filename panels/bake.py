@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import bpy
 
+from .jobs import draw_interrupted, draw_jobs, draw_messages
 from .layout import Sidebar, wrapped
 
 
@@ -20,25 +21,20 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
         layout, settings, session = self.layout, context.scene.prt, context.window_manager.prt
         layout.use_property_split = True
         layout.use_property_decorate = False
+        draw_interrupted(layout, context)
         layout.label(text=_targets(context), icon="MESH_DATA")
         column = layout.column()
-        column.enabled = not session.running
         column.prop(settings, "preset")
         column.prop(settings, "lighting")
         distant = column.column()
         distant.active = settings.lighting != "local"  # lamps of a cloud know no order
         distant.prop(settings, "order")
         column.prop(settings, "bounces")
-        if session.running:
-            layout.label(text=session.stage)
-            layout.progress(factor=session.fraction, text=_progress(session))
-            layout.operator("prt.cancel", icon="CANCEL")
-        else:
-            row = layout.row(align=True)
-            row.operator("prt.bake", text="Bake", icon="RENDER_STILL")
-            row.operator("prt.analyze", icon="VIEWZOOM")
-        if session.message:
-            wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
+        row = layout.row(align=True)
+        row.operator("prt.bake", text="Bake Next" if session.running else "Bake", icon="RENDER_STILL")
+        row.operator("prt.analyze", icon="VIEWZOOM")
+        draw_jobs(layout, context)
+        draw_messages(layout, context)
         if session.analysis:
             box = layout.box()
             for line in session.analysis.splitlines():
@@ -51,13 +47,11 @@ class _Expert(Sidebar):
     bl_parent_id = "PRT_PT_bake"
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
-    def column(self, context: bpy.types.Context) -> bpy.types.UILayout:
-        """A column for settings, greyed while a bake runs."""
+    def column(self, _context: bpy.types.Context) -> bpy.types.UILayout:
+        """A column for settings: of the next bake, while one runs."""
         self.layout.use_property_split = True
         self.layout.use_property_decorate = False
-        column = self.layout.column()
-        column.enabled = not context.window_manager.prt.running
-        return column
+        return self.layout.column()
 
 
 class PRT_PT_highlights(_Expert, bpy.types.Panel):
@@ -111,8 +105,3 @@ class PRT_PT_local_lights(_Expert, bpy.types.Panel):
 def _targets(context: bpy.types.Context) -> str:
     count = sum(o.type == "MESH" for o in context.selected_objects)
     return "All visible meshes" if count == 0 else f"{count} selected mesh{'' if count == 1 else 'es'}"
-
-
-def _progress(session: bpy.types.PropertyGroup) -> str:
-    text = f"{100.0 * session.fraction:.0f} %"
-    return text if session.seconds_left < 0.0 else f"{text}, {session.seconds_left:.0f} s left"

@@ -173,6 +173,24 @@ class BakeProcess:
         return error_message(PRTError("Bake", cause, remedy))
 
 
+class CompletedBake:
+    """Stands for the process of a bake that was complete before: its result lies in the job folder already."""
+
+    finished = False
+
+    def poll(self) -> list[Message]:
+        """The end, at once."""
+        self.finished = True
+        return [{"type": "done"}]
+
+    def wait(self, _interval: float = 0.0) -> Iterator[Message]:
+        """As `poll`."""
+        yield from self.poll()
+
+    def cancel(self) -> None:
+        """Nothing runs."""
+
+
 def error_message(error: PRTError) -> Message:
     """The "error" message that stands for a PRTError."""
     return {"type": "error", "subject": error.subject, "cause": error.cause, "remedy": error.remedy,
