@@ -16,6 +16,7 @@ from pathlib import Path
 CLAIM_FILE = "in_use.lock"
 # File systems that know no locks (some network folders): there a folder counts as free.
 NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
+RACES = 20  # lost against owners who remove the same folder, after which the error is another one
 
 
 class Claim:
@@ -48,6 +49,18 @@ class Claim:
                 os.close(descriptor)
                 raise
             os.close(descriptor)
+
+    @staticmethod
+    def make(folder: Path) -> Claim | None:
+        """Make a folder if it is missing, and `take` it. Raises OSError where it can't be made or written."""
+        for _ in range(RACES):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                return Claim.take(folder)
+            except (FileNotFoundError, FileExistsError):  # its last owner is just removing it
+                continue
+        folder.mkdir(parents=True, exist_ok=True)
+        return Claim.take(folder)
 
     def release(self) -> None:
         """Let others have the folder. May be called twice."""

@@ -81,8 +81,7 @@ def _claim(root: Path, name: str) -> Claim:
     """The first folder of this name, with a number from the second on, in which nobody works."""
     for folder in (root / (name if number == 1 else f"{name}-{number}") for number in count(1)):
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            claim = Claim.take(folder)
+            claim = Claim.make(folder)
         except OSError as error:
             raise StorageError(str(folder), f"the job folder can't be made ({error.strerror})",
                                "Free some space, or choose a folder that can be written") from error
