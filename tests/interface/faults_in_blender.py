@@ -43,7 +43,7 @@ from driving import (
 QUICK = "error_receivers=0"
 # Finished stages soon, and then seconds of measuring the error.
 LONG = "error_receivers=512, error_paths=65536"
-MIDDLE = "error_receivers=64, error_paths=65536"
+MIDDLE = "error_receivers=8, error_paths=65536"
 
 
 def bake(*names: str, overrides: str = LONG) -> set[str]:
@@ -184,7 +184,7 @@ def edit_mode() -> Step:
     assert session().running and not children()
     with override():
         bpy.ops.object.mode_set(mode="OBJECT")
-    yield from wait_for_bake()
+    yield from until(lambda: not session().running, "never stored")
     assert not session().failed and header("Statue") != before, session().message
 
 
