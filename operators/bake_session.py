@@ -201,7 +201,7 @@ class BakeSession:
             if target is not None:
                 write_baked(target, result.objects[name], self.digests[name], self.surroundings)
         self.notes += [f"{name} was deleted meanwhile, and its bake dropped" for name in gone]
-        return result
+        return replace(result, objects={name: baked for name, baked in result.objects.items() if name not in gone})
 
     def targets(self) -> dict[str, bpy.types.Object | None]:
         """The targets as they are in the scene now, by the names that they had. Raises BadScene without the scene."""
@@ -272,7 +272,11 @@ def _check_storable(targets: list[bpy.types.Object]) -> None:
 def _drop_forgotten(folder: Path) -> None:
     """Remove jobs that nobody resumed: an interrupted bake of a scene since edited would lie there for ever."""
     for job in folder.glob("bake-*"):
-        if time.time() - job.stat().st_mtime > KEPT_DAYS * 86400:
+        try:
+            age = time.time() - job.stat().st_mtime
+        except OSError:  # another Blender has just removed it
+            continue
+        if age > KEPT_DAYS * 86400:
             discard_if_free(job)
 
 

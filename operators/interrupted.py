@@ -85,6 +85,18 @@ class PRT_OT_resume(JobMixin, bpy.types.Operator):
         assign(session(context), interrupted="\n".join(left))
         return request
 
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return self._offered_again(JobMixin.execute(self, context))
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return self._offered_again(JobMixin.invoke(self, context, event))
+
+    def _offered_again(self, outcome: set[str]) -> set[str]:
+        """What could not even begin stays on offer."""
+        if outcome == {"CANCELLED"}:
+            look()
+        return outcome
+
 
 class PRT_OT_discard_interrupted(bpy.types.Operator):
     """Drop an interrupted bake and its finished stages. Frees their disk space; stored bakes stay"""

@@ -286,6 +286,8 @@ def _show_waiting() -> None:
 
 def _let_go(context: bpy.types.Context) -> None:
     """Take timer, progress and status texts back."""
+    if context.window_manager is None:  # Blender is about to end
+        return
     if JobMixin.timer is not None:
         context.window_manager.event_timer_remove(JobMixin.timer)
         JobMixin.timer = None
