@@ -7,12 +7,13 @@ import bpy
 
 from ..prt_addon.baking.settings import make_settings, parse_overrides
 from .bake_request import BakeRequest
+from .bake_session import chosen_targets
 from .job_mixin import JobMixin
 
 
 class PRT_OT_bake(JobMixin, bpy.types.Operator):
-    """Bake how the selected meshes (all visible ones when none is selected) respond to light.
-    Blender stays usable meanwhile; the previous bake is replaced only by a complete new one.
+    """Bake how the selected meshes (all visible ones when none is selected), or those of a collection, respond to
+    light. Blender stays usable meanwhile; the previous bake is replaced only by a complete new one.
     While a bake runs, the next one waits for it: with the selection and the settings of now, but with the meshes,
     materials and places that are found when its turn comes. Reading the scene, at its start, can't be cancelled"""
 
@@ -37,10 +38,10 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
         return True
 
     def make_request(self, context: bpy.types.Context) -> BakeRequest:
-        """The selection and the settings of now."""
+        """The selection or collection, and the settings, of now."""
         settings = make_settings(context.scene.prt.preset,
                                  context.scene.prt.overrides() | parse_overrides(self.overrides))
-        return BakeRequest.of_selection(context, settings)
+        return BakeRequest.of_choice(context, settings, chosen_targets(context.scene))
 
 
 class PRT_OT_follow_bakes(JobMixin, bpy.types.Operator):

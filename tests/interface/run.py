@@ -32,6 +32,7 @@ SCRIPTS = {
     "lamps": ("lamps_in_blender.py", "make_room.py"),
     "faults": ("faults_in_blender.py", "make_scene.py"),
     "killed": ("killed_in_blender.py", "make_scene.py"),
+    "untouched": ("untouched_in_blender.py", "make_scene.py"),
 }
 RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
