@@ -107,7 +107,6 @@ class PRT_PT_compression(_Expert, bpy.types.Panel):
         coherent.active = settings.lighting == "environment"  # it would move receivers out of their zones
         coherent.prop(settings, "coherence")
         measured = self.layout.column(heading="Measure the Error at")
-        measured.enabled = column.enabled
         measured.prop(settings, "error_receivers")
         paths = measured.column()
         paths.active = settings.error_receivers > 0
