@@ -30,8 +30,11 @@ UI_SECONDS = 600
 SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
+    "faults": ("faults_in_blender.py", "make_scene.py"),
+    "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
 }
+RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
 
 
@@ -160,11 +163,29 @@ def blender_process(output: Path) -> int:
 
 def interface_results(blender: Blender, script: str, results: str, scene: Path) -> list[tuple[str, str]]:
     """Name and failure (empty: passed) of each step that a script took."""
+    if script == RESTARTED:
+        return restarted_results(blender, script, scene)
     results = blender.output / results
     blender.script(script, str(blender.output), str(scene))
     if not results.is_file():
         return [(script, f"left no results; see {blender.output / f'{script}.log'}")]
     return [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+
+
+def restarted_results(blender: Blender, script: str, scene: Path) -> list[tuple[str, str]]:
+    """`interface_results` of the script that is started again as long as killed.again holds the next start's number."""
+    again, number, outcomes = blender.output / "killed.again", 1, []
+    while number:
+        blender.script(script, str(blender.output), str(scene))
+        (blender.output / f"{script}.log").replace(blender.output / f"{script}.{number}.log")
+        results = blender.output / f"killed_{number}.json"
+        if results.is_file():
+            outcomes += [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+        following = int(again.read_text()) if again.is_file() else 0
+        if not results.is_file() and following <= number:
+            outcomes.append((script, f"start {number} left no results; see {script}.{number}.log"))
+        number = following if following > number else 0
+    return outcomes
 
 
 def make_scene(blender: Blender, script: str, outcomes: list[tuple[str, str]]) -> Path:
