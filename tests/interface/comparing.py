@@ -22,7 +22,7 @@ from mathutils import Vector
 # Levels of 255 that the picture may differ from the oracle in the mean, and all but a hundredth of the vertices: it is
 # rounded to levels, and bends at a vertex within a pixel.
 MEAN_LEVELS, MOST_LEVELS = 0.6, 4.0
-PATIENCE = 25.0  # seconds
+PATIENCE = 15.0  # seconds
 RIM = 0.35  # cosine to the eye below which a curved rim is narrower than a pixel
 AROUND = 2.0  # pixels around a vertex in which nothing else may be seen
 HEIGHT = 1000  # of the screen
