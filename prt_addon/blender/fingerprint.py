@@ -29,7 +29,7 @@ def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgra
     evaluated = scene_object.evaluated_get(depsgraph)
     if not evaluated.is_evaluated:
         return None
-    parts = [_mesh_digest(evaluated.data)] if isinstance(evaluated.data, bpy.types.Mesh) else []
+    parts = [_evaluated_digest(evaluated)] if isinstance(evaluated.data, bpy.types.Mesh) else []
     parts += _uv_digests(scene_object)
     if not _instances_nothing(evaluated):
         to_local = np.linalg.pinv(np.array(scene_object.matrix_world, np.float64))  # small
@@ -49,6 +49,16 @@ def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgra
 def _instances_nothing(evaluated: bpy.types.Object) -> bool:
     return evaluated.type == "MESH" and not evaluated.is_instancer and not evaluated.particle_systems and not any(
         modifier.type == "NODES" for modifier in evaluated.modifiers)
+
+
+def _evaluated_digest(evaluated: bpy.types.Object) -> str:
+    """Of an evaluated object's mesh; in edit mode of the mesh as it is being edited, which has no arrays of its own."""
+    if not evaluated.data.is_editmode:
+        return _mesh_digest(evaluated.data)
+    try:
+        return _mesh_digest(evaluated.to_mesh())
+    finally:
+        evaluated.to_mesh_clear()
 
 
 def _mesh_digest(mesh: bpy.types.Mesh) -> str:
@@ -125,7 +135,7 @@ def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
             continue
         pointer = mesh.as_pointer()
         if pointer not in meshes:
-            meshes[pointer] = _mesh_digest(mesh)
+            meshes[pointer] = _evaluated_digest(source)
         place = np.array(instance.matrix_world, np.float64)
         # Geometry that nodes made has its instancer for a source, and many meshes.
         name = owner.name_full if source.original == owner else f"{owner.name_full}/{source.original.name_full}"

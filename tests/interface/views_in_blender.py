@@ -97,6 +97,10 @@ def steady() -> None:
             bpy.ops.object.mode_set(mode="OBJECT")
     select()
     space().shading.type, space().overlay.show_overlays = "SOLID", False
+    if space().local_view:
+        with override():
+            bpy.ops.view3d.localview(frame_selected=False)
+    look()
     if not session().preview:
         with override():
             bpy.ops.prt.toggle_preview()
@@ -207,19 +211,26 @@ def kinds_of_view() -> Step:
     space().region_3d.view_perspective = "CAMERA"
     space().region_3d.view_camera_zoom = 0.0
     camera.show_passepartout = True
-    inside = (330, 480, 130, 130)
-    yield from check_view("v21_camera", BAKED, clear=inside)
+    yield 1.0
+    yield from check_view("v21_camera", BAKED, clear=inside_frame())
     camera.shift_x, camera.shift_y, camera.lens = 0.08, -0.05, 40.0
-    yield from check_view("v22_camera_shifted", BAKED, clear=inside)
+    yield 1.0
+    yield from check_view("v22_camera_shifted", BAKED, clear=inside_frame())
     camera.shift_x, camera.shift_y = 0.0, 0.0
     camera.type, camera.ortho_scale = "ORTHO", 5.5
-    yield from check_view("v23_camera_orthographic", BAKED, clear=inside)
+    yield 1.0
+    yield from check_view("v23_camera_orthographic", BAKED, clear=inside_frame())
     camera.type, camera.lens = "PERSP", 50.0
     bpy.context.scene.render.use_border = True
     for name, value in (("min_x", 0.25), ("max_x", 0.75), ("min_y", 0.25), ("max_y", 0.75)):
         setattr(bpy.context.scene.render, f"border_{name}", value)
     space().shading.type = "RENDERED"
-    yield from check_view("v24_camera_border", BAKED, clear=(520, 660, 250, 250))
+    yield 1.0
+    left, right, top, bottom = inside_frame()
+    box = region()
+    across, up = (box.width - left - right) // 4, (box.height - top - bottom) // 4
+    yield from check_view("v24_camera_border", BAKED, least=50,
+                          clear=(left + across, right + across, top + up, bottom + up))
     bpy.context.scene.render.use_border = False
     space().shading.type = "SOLID"
     look()
@@ -238,6 +249,16 @@ def kinds_of_view() -> Step:
     yield 1.0
     look()
     yield from check_view("v27_single_again", BAKED)
+
+
+def inside_frame() -> tuple[int, int, int, int]:
+    """Pixels at the left, right, top and bottom of the viewport that lie outside the camera's frame."""
+    camera, box = bpy.context.scene.camera, region()
+    corners = np.array([camera.matrix_world @ corner for corner in camera.data.view_frame(scene=bpy.context.scene)])
+    clip = np.c_[corners, np.ones(4)] @ np.array(space().region_3d.perspective_matrix).T
+    place = (0.5 * clip[:, :2] / clip[:, 3:] + 0.5) * (box.width, box.height)
+    (left, bottom), (right, top) = place.min(axis=0), place.max(axis=0)
+    return tuple(int(v) + 4 for v in (left, max(box.width - right, 330), box.height - top, bottom))
 
 
 def local_view() -> Step:
