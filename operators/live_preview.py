@@ -82,6 +82,7 @@ class Live:
     shown: dict[str, Shown] = field(default_factory=dict)
     lines: list[Line] = field(default_factory=list)
     known: Hashable = None
+    around: dict[str, str] = field(default_factory=dict)
     message: str = ""
     light: NDArray[np.float64] | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
@@ -225,6 +226,7 @@ def _known_bakes() -> Hashable:
 def _read_bakes() -> None:
     """Read all baked objects of the scene; what can't be read is not shown, and the panel says why."""
     _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known_bakes()
+    _live.lamps.forget_geometry()
     layer = {found.name_full for found in bpy.context.view_layer.objects}
     for found in baked_objects(bpy.context.scene):
         line = Line(found.name_full)
@@ -299,10 +301,12 @@ def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
 def _read_stale() -> None:
     """Compare the baked objects with what they were baked from."""
     _live.stale_dirty = False
-    _live.lamps.forget_geometry()
     started = time.perf_counter()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
+    if around != _live.around:
+        _live.around = around
+        _live.lamps.forget_geometry()
     objects = {found.name_full: found for found in bpy.context.scene.objects}
     changed = False
     for line in _live.lines:

@@ -8,6 +8,7 @@ software driver takes its time, the steps of VULKAN alone.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -395,6 +396,10 @@ VULKAN = (open_and_bake, shadings, light_moves, reload, disable)
 
 
 def chosen() -> tuple:
+    """The steps of this driver, or those that PRT_STEPS names after the first one."""
+    names = os.environ.get("PRT_STEPS", "").split()
+    if names:
+        return (open_and_bake, *(step for step in ALL if step.__name__ in names))
     return VULKAN if gpu.platform.backend_type_get() == "VULKAN" else ALL
 
 
