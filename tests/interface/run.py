@@ -31,6 +31,7 @@ SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
     "views": ("views_in_blender.py", "make_views.py"),
+    "changes": ("changes_in_blender.py", "make_views.py"),
 }
 COMMAND_SECONDS = 240
 

@@ -339,6 +339,38 @@ def selection_is_seen() -> Step:
     space().overlay.show_overlays = False
 
 
+def in_front() -> Step:
+    """What is not baked and stands in front is not covered, though without overlays Blender leaves no depth."""
+    steady()
+    scene = bpy.context.scene
+    for name, kind, engine in (("v45_eevee", "RENDERED", "BLENDER_EEVEE"), ("v46_cycles", "RENDERED", "CYCLES"),
+                               ("v47_solid", "SOLID", "BLENDER_EEVEE")):
+        space().shading.type, scene.render.engine, scene.cycles.preview_samples = kind, engine, 4
+        yield from check_view(f"{name}_lit", BAKED)
+        lit = shoot(f"{name}_lit")
+        with override():
+            bpy.ops.prt.toggle_preview()
+        yield 2.0 * DRAWN
+        plain = shoot(f"{name}_plain")
+        with override():
+            bpy.ops.prt.toggle_preview()
+        places = middle_of_post()
+        off = np.abs(lit[places[:, 0], places[:, 1]].astype(float) - plain[places[:, 0], places[:, 1]])
+        print(f"{name}: {len(off)} pixels of the post, {off.mean():.2f} levels", flush=True)
+        assert len(off) > 200 and off.mean() < 4.0, f"{name}: the post in front is {off.mean():.1f} levels off"
+    scene.render.engine = "BLENDER_EEVEE"
+
+
+def middle_of_post() -> np.ndarray:
+    """Rows and columns (n, 2) of pixels on the post's upright edge that faces the viewer."""
+    box, matrix = region(), np.array(space().region_3d.perspective_matrix)
+    heights, across = np.meshgrid(np.linspace(0.1, 0.65, 40), np.linspace(0.05, 0.25, 12))
+    corner = np.stack([0.35 + across, np.full_like(across, -1.05), heights], axis=-1).reshape(-1, 3)
+    clip = np.c_[corner, np.ones(len(corner))] @ matrix.T
+    place = (0.5 * clip[:, :2] / clip[:, 3:] + 0.5) * (box.width, box.height)
+    return np.stack([1000 - (box.y + place[:, 1]), box.x + place[:, 0]], axis=1).astype(int)
+
+
 def viewport_border() -> Step:
     """A render region of the viewport."""
     steady()
@@ -391,7 +423,7 @@ def disable() -> Step:
 
 
 ALL = (open_and_bake, shadings, see_through, light_moves, during_a_bake, kinds_of_view, local_view, modes,
-       selection_is_seen, viewport_border, reload, disable)
+       selection_is_seen, in_front, viewport_border, reload, disable)
 VULKAN = (open_and_bake, shadings, light_moves, reload, disable)
 
 
@@ -403,4 +435,5 @@ def chosen() -> tuple:
     return VULKAN if gpu.platform.backend_type_get() == "VULKAN" else ALL
 
 
-start(chosen(), "views")
+if __name__ == "__main__":
+    start(chosen(), "views")
