@@ -96,6 +96,8 @@ def steady() -> None:
     if bpy.context.mode != "OBJECT":
         with override():
             bpy.ops.object.mode_set(mode="OBJECT")
+    for scene_object in bpy.context.scene.objects:
+        scene_object.hide_set(False)
     select()
     space().shading.type, space().overlay.show_overlays = "SOLID", False
     if space().local_view:
