@@ -187,6 +187,24 @@ def read_mesh(mesh: bpy.types.Mesh) -> MeshArrays:
     return MeshArrays(positions, triangles, corners, normals[corners], material_index)
 
 
+def read_object_triangles(evaluated: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """`read_triangles` of an evaluated object, as it is edited and subdivided."""
+    try:
+        return read_triangles(evaluated.to_mesh())
+    finally:
+        evaluated.to_mesh_clear()
+
+
+def read_triangles(mesh: bpy.types.Mesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Positions (v, 3) of a mesh in its own space, and triangles (t, 3)."""
+    mesh.calc_loop_triangles()
+    positions = np.empty((len(mesh.vertices), 3), np.float32)
+    triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+    mesh.vertices.foreach_get("co", positions.ravel())
+    mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+    return positions, triangles
+
+
 def _check_finite(positions: NDArray[np.float32], name: str) -> None:
     """Raise BadScene before anything is traced or shaded at coordinates that are no numbers."""
     bad = int((~np.isfinite(positions).all(axis=1)).sum())
