@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 import OpenEXR
 import pytest
+from mathutils import Matrix
 
 from prt_addon.lighting.cubemap_light import total_flux
 from prt_addon.lighting.environment import direction_of_pixel
@@ -137,6 +138,19 @@ def test_light_of_a_turned_object(baked: Path) -> None:
         assert len(live.rotated) == 1
     finally:
         live.light, live.rotated = None, {}
+
+
+def test_a_set_that_turned_as_a_whole_sees_the_light_turned_back(baked: Path, tmp_path: Path) -> None:
+    """A quarter turn of everything under a sky that is turned along: as before, to rounding."""
+    from tests.blender.test_moved_bakes import move
+
+    moved = tmp_path / "moved.blend"
+    for degrees, bound in ((90.0, 1e-4), (37.0, 0.03)):
+        move(baked, moved, Matrix.Rotation(math.radians(degrees), 4, "Z"), with_lamps=True)
+        before = relit(baked, tmp_path / "a.npz", "--environment", half_sky(tmp_path / "s.exr"))
+        after = relit(moved, tmp_path / "b.npz", "--environment", half_sky(tmp_path / f"{degrees}.exr", degrees))
+        power = np.sqrt(np.mean(before["radiance"] ** 2))
+        assert np.sqrt(np.mean((after["radiance"] - before["radiance"]) ** 2)) < bound * power
 
 
 def test_preview_draws_what_relight_says(baked: Path, tmp_path: Path) -> None:
