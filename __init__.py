@@ -5,15 +5,17 @@ from __future__ import annotations
 
 import bpy
 
-from .operators import commands, live_preview, properties
+from .operators import commands, follow_frames, light_icons, light_presets, light_properties, live_preview, properties
 from .operators.analyze import PRT_OT_analyze
 from .operators.bake import PRT_OT_bake, PRT_OT_cancel
 from .operators.clear import PRT_OT_clear
 from .operators.job_mixin import JobMixin
+from .operators.keyframe_light import PRT_OT_keyframe_light
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
 from .panels.bake import PRT_PT_bake
 from .panels.lamp import PRT_PT_lamp
+from .panels.light_presets import PRT_PT_light_animation, PRT_PT_light_presets, PRT_PT_lights
 from .panels.preview import PRT_PT_preview
 from .panels.properties_editor import PRT_PT_object, PRT_PT_world
 from .panels.results import PRT_PT_results
@@ -23,18 +25,24 @@ CLASSES = (
     properties.PRTSettings,
     properties.PRTBakedObject,
     properties.PRTSession,
+    *light_properties.CLASSES,
     PRT_OT_analyze,
     PRT_OT_bake,
     PRT_OT_cancel,
     PRT_OT_clear,
     PRT_OT_toggle_preview,
     PRT_OT_relight,
+    *light_presets.CLASSES,
+    PRT_OT_keyframe_light,
     PRT_PT_bake,
     PRT_PT_rays,
     PRT_PT_highlights,
     PRT_PT_local_lights,
     PRT_PT_compression,
     PRT_PT_preview,
+    PRT_PT_light_presets,
+    PRT_PT_lights,
+    PRT_PT_light_animation,
     PRT_PT_results,
     PRT_PT_lamp,
     PRT_PT_object,
@@ -47,7 +55,9 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     properties.register()
+    light_properties.register()
     live_preview.register()
+    follow_frames.register()
     commands.register()
 
 
@@ -55,7 +65,10 @@ def unregister() -> None:
     """Called by Blender when the extension is disabled: nothing stays behind."""
     JobMixin.stop_now()
     commands.unregister()
+    follow_frames.unregister()
     live_preview.unregister()
+    light_icons.unregister()
+    light_properties.unregister()
     properties.unregister()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
