@@ -18,7 +18,7 @@ from .properties import redraw
 class _LightOperator(bpy.types.Operator):
     """What operators of lights share: one undo step each, one report each."""
 
-    bl_options = {"REGISTER", "UNDO", "INTERNAL"}
+    bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -37,6 +37,36 @@ def unique_name(wanted: str, others: list[str]) -> str:
     return next(name for number in range(1, len(others) + 2) if (name := f"{stem}.{number:03d}") not in others)
 
 
+# Blender evaluates annotations on its own: a lambda in one of them would not find this module's names.
+def _icon(preset: PRTLightPreset) -> int:
+    return icon_of(preset.thumbnail)
+
+
+def _follow_message(_lighting: PRTLighting) -> str:
+    return follow_frames.message()
+
+
+def _background(lighting: PRTLighting) -> str:
+    return node_named(lighting.id_data.world, "ShaderNodeBackground")
+
+
+def _mapping(lighting: PRTLighting) -> str:
+    return node_named(lighting.id_data.world, "ShaderNodeMapping")
+
+
+def _differs(lighting: PRTLighting) -> bool:
+    """Whether the scene's light is not the active preset's any more. Some milliseconds for a hundred lights."""
+    preset = lighting.chosen()
+    if preset is None:
+        return False
+    try:
+        state = json.loads(preset.state)
+    except ValueError:
+        return False
+    now = read_lighting(lighting.id_data)
+    return any(now[part] != state.get(part) for part in ("world", "lights"))
+
+
 class PRTLightImage(bpy.types.PropertyGroup):
     """An image that a preset's World shows. `name` is the name that it had then."""
 
@@ -51,7 +81,7 @@ class PRTLightPreset(bpy.types.PropertyGroup):
     thumbnail: StringProperty()
     world: PointerProperty(type=bpy.types.World)
     images: CollectionProperty(type=PRTLightImage)
-    icon: IntProperty(get=lambda preset: icon_of(preset.thumbnail))
+    icon: IntProperty(get=_icon)
 
 
 class PRTSoloLight(bpy.types.PropertyGroup):
@@ -78,27 +108,14 @@ class PRTLighting(bpy.types.PropertyGroup):
                     "playback and renders show it in materials that read it. Costs one relighting per frame, and "
                     "nothing when off",
     )
-    follow_message: StringProperty(get=lambda _lighting: follow_frames.message())
-    modified: BoolProperty(get=lambda lighting: _differs(lighting))
-    background: StringProperty(get=lambda lighting: node_named(lighting.id_data.world, "ShaderNodeBackground"))
-    mapping: StringProperty(get=lambda lighting: node_named(lighting.id_data.world, "ShaderNodeMapping"))
+    follow_message: StringProperty(get=_follow_message)
+    modified: BoolProperty(get=_differs)
+    background: StringProperty(get=_background)
+    mapping: StringProperty(get=_mapping)
 
     def chosen(self) -> PRTLightPreset | None:
         """The preset that was stored or applied last."""
         return self.presets[self.active] if 0 <= self.active < len(self.presets) else None
-
-
-def _differs(lighting: PRTLighting) -> bool:
-    """Whether the scene's light is not the active preset's any more. Some milliseconds for a hundred lights."""
-    preset = lighting.chosen()
-    if preset is None:
-        return False
-    try:
-        state = json.loads(preset.state)
-    except ValueError:
-        return False
-    now = read_lighting(lighting.id_data)
-    return any(now[part] != state.get(part) for part in ("world", "lights"))
 
 
 CLASSES = (PRTLightImage, PRTLightPreset, PRTSoloLight, PRTLighting)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The lighting of a scene as plain values, and back: the World, and every light with its place, shape, colour, switches.
+"""The lighting of a scene as plain values, and back: the World, and each light with its place, shape, colour, switches.
 
 A state is a dictionary of JSON's kinds alone; floats come back to the bit. Writing touches what the state names and
 nothing else, and only values that differ. What can't be written is said in one line each; the rest is applied.
@@ -213,7 +213,7 @@ def _write_image(owner: bpy.types.ID, node: bpy.types.Node, told: State, images:
 def _write_light(found: bpy.types.Object, state: State, written: dict[str, tuple[str, State]],
                  notes: list[str]) -> None:
     """One light; `written` keeps whose values each data got, since several lights may have come to share it."""
-    _assign(found, found, {name: value for name, value in state["object"].items()}, found.name, notes)
+    _assign(found, found, state["object"], found.name, notes)
     data = found.data
     wanted = {"data": state["data"], "nodes": state.get("nodes", {})}
     other, before = written.setdefault(data.name_full, (found.name, wanted))
