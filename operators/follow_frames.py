@@ -135,7 +135,18 @@ def _on_frame_change(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> 
     if scene != bpy.context.scene:
         _say(f"scene {scene.name} is not the one of the window, so its colors stay")
         return
+    if depsgraph.mode == "RENDER":
+        _catch_up(scene)
     _follow(scene)
+
+
+def _catch_up(scene: bpy.types.Scene) -> None:
+    """Have the window's depsgraph evaluate this frame: a render has one of its own, and what animation says reaches
+    the data-blocks, from which World and switches are read, only through the window's, which is evaluated only if
+    something in it is tagged."""
+    first = next(iter(baked_objects(scene)), None)
+    if first is not None:
+        baked_mesh(first).update_tag()  # it will be tagged in any case
 
 
 @persistent

@@ -12,6 +12,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))  # Blender runs this file by its path
 
+import itertools
+
 from driving import (
     DRAWN,
     MODULE,
@@ -71,8 +73,8 @@ def shrunk(picture: np.ndarray, height: int, width: int) -> np.ndarray:
     """A picture averaged to fewer pixels."""
     rows = np.arange(height + 1) * picture.shape[0] // height
     columns = np.arange(width + 1) * picture.shape[1] // width
-    return np.array([[picture[a:b, c:d].mean(axis=(0, 1)) for c, d in zip(columns[:-1], columns[1:], strict=True)]
-                     for a, b in zip(rows[:-1], rows[1:], strict=True)])
+    return np.array([[picture[a:b, c:d].mean(axis=(0, 1)) for c, d in itertools.pairwise(columns)]
+                     for a, b in itertools.pairwise(rows)])
 
 
 def open_and_bake() -> Step:
