@@ -5,10 +5,20 @@ from __future__ import annotations
 
 import bpy
 
-from .operators import commands, follow_frames, light_icons, light_presets, light_properties, live_preview, properties
+from .operators import (
+    commands,
+    follow_frames,
+    interrupted,
+    light_icons,
+    light_presets,
+    light_properties,
+    live_preview,
+    properties,
+)
 from .operators.analyze import PRT_OT_analyze
-from .operators.bake import PRT_OT_bake, PRT_OT_cancel
+from .operators.bake import PRT_OT_bake, PRT_OT_cancel, PRT_OT_cancel_all, PRT_OT_follow_bakes
 from .operators.clear import PRT_OT_clear
+from .operators.interrupted import PRT_OT_discard_interrupted, PRT_OT_resume
 from .operators.job_mixin import JobMixin
 from .operators.keyframe_light import PRT_OT_keyframe_light
 from .operators.preview import PRT_OT_toggle_preview
@@ -29,6 +39,10 @@ CLASSES = (
     PRT_OT_analyze,
     PRT_OT_bake,
     PRT_OT_cancel,
+    PRT_OT_cancel_all,
+    PRT_OT_follow_bakes,
+    PRT_OT_resume,
+    PRT_OT_discard_interrupted,
     PRT_OT_clear,
     PRT_OT_toggle_preview,
     PRT_OT_relight,
@@ -58,6 +72,7 @@ def register() -> None:
     light_properties.register()
     live_preview.register()
     follow_frames.register()
+    interrupted.register()
     commands.register()
 
 
@@ -66,6 +81,7 @@ def unregister() -> None:
     JobMixin.stop_now()
     commands.unregister()
     follow_frames.unregister()
+    interrupted.unregister()
     live_preview.unregister()
     light_icons.unregister()
     light_properties.unregister()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import environment_picture
-from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
+from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import PRTError
 from .relit import relit
 
@@ -38,8 +38,8 @@ def lit_picture(context: bpy.types.Context) -> NDArray[np.uint8] | None:
     from ..gpu_shaders.thumbnail import draw_thumbnail
 
     lit = relit(scene, baked, window=scene.prt.window)
-    items = [DrawItem(name, b, transform_since_bake(scene.objects[name], b.header), lit.light[name],
-                      2.0 ** scene.prt.exposure, name in old, direct=lit.direct[name]) for name, b in baked.items()]
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], 2.0 ** scene.prt.exposure, name in old,
+                      direct=lit.direct[name]) for name, b in baked.items()]
     sky = None if scene.render.film_transparent else environment_picture(scene, depsgraph)
     return draw_thumbnail(scene, items, sky, *_viewport(context))
 
