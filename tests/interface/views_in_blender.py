@@ -123,14 +123,19 @@ def shadings() -> Step:
     scene.render.engine = "CYCLES"
     scene.cycles.preview_samples = 4
     yield from check_view("v05_cycles", BAKED)
-    space().overlay.show_overlays = True
-    space().overlay.show_floor = space().overlay.show_axis_x = space().overlay.show_axis_y = False
-    space().overlay.show_cursor = space().overlay.show_object_origins = space().overlay.show_extras = False
-    space().overlay.show_text = False
+    show_outlines_alone()
     yield from check_view("v06_cycles_overlays", BAKED)
     shading.type, scene.render.engine = "SOLID", "BLENDER_EEVEE"
     scene.view_settings.view_transform = "AgX"
     yield from check_view("v07_solid_overlays", BAKED)
+
+
+def show_outlines_alone() -> None:
+    """Overlays without what stands in front of surfaces."""
+    overlay = space().overlay
+    overlay.show_overlays = True
+    overlay.show_floor = overlay.show_axis_x = overlay.show_axis_y = overlay.show_cursor = False
+    overlay.show_object_origins = overlay.show_extras = overlay.show_text = False
 
 
 def see_through() -> Step:
@@ -327,7 +332,7 @@ def modes() -> Step:
 def selection_is_seen() -> Step:
     """The outline of a selected object stands around it, and what is in front hides what is behind."""
     steady()
-    space().overlay.show_overlays = True
+    show_outlines_alone()
     yield 1.0
     before = view(shoot("v36_not_selected"))
     select("Ball", "Wall")
