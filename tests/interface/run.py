@@ -30,10 +30,13 @@ UI_SECONDS = 600
 SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
+    "faults": ("faults_in_blender.py", "make_scene.py"),
+    "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
     "views": ("views_in_blender.py", "make_views.py"),
     "changes": ("changes_in_blender.py", "make_views.py"),
 }
+RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
 # What may not stand in a log: tracebacks, and warnings of Blender's own log (of the GPU module above all).
 COMPLAINT = re.compile(r"^Traceback|^Exception ignored|\| (WARNING|ERROR|FATAL) |^(Warning|Error)\b|Validation")
@@ -61,10 +64,10 @@ class Blender:
 
     def script(self, name: str, *arguments: str, options: tuple[str, ...] = (), log_name: str = "") -> None:
         """Run a script with the interface, options being Blender's; its output lands in the output folder."""
-        with open(self.output / f"{log_name or name}.log", "w", encoding="utf-8") as log:
+        with open(self.output / f"{log_name or Path(name).name}.log", "w", encoding="utf-8") as log:
             subprocess.run([*self.ui, *options, "--python-exit-code", "1", "--python", str(HERE / name), "--",
-                            *arguments], env=self.environment, stdout=log, stderr=subprocess.STDOUT,
-                           timeout=UI_SECONDS, check=False)
+                             *arguments], env=self.environment, stdout=log, stderr=subprocess.STDOUT,
+                            timeout=UI_SECONDS, check=False)
 
 
 def results(done: subprocess.CompletedProcess[str]) -> list[str]:
@@ -169,6 +172,8 @@ def blender_process(output: Path) -> int:
 def interface_results(blender: Blender, script: str, results: str, scene: Path, vulkan: bool = False,
                       ) -> list[tuple[str, str]]:
     """Name and failure (empty: passed) of each step that a script took, and whether its log is clean."""
+    if script == RESTARTED:
+        return restarted_results(blender, script, scene)
     results = blender.output / results
     results.unlink(missing_ok=True)
     log_name = f"{script}.vulkan" if vulkan else script
@@ -188,6 +193,22 @@ def complaints_in(log: str) -> list[str]:
     """Lines of a log that should not be there, each once."""
     return list(dict.fromkeys(line for line in log.splitlines()
                               if COMPLAINT.search(line) and not EXPECTED.search(line)))
+
+
+def restarted_results(blender: Blender, script: str, scene: Path) -> list[tuple[str, str]]:
+    """`interface_results` of the script that is started again as long as killed.again holds the next start's number."""
+    again, number, outcomes = blender.output / "killed.again", 1, []
+    while number:
+        blender.script(script, str(blender.output), str(scene))
+        (blender.output / f"{script}.log").replace(blender.output / f"{script}.{number}.log")
+        results = blender.output / f"killed_{number}.json"
+        if results.is_file():
+            outcomes += [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+        following = int(again.read_text()) if again.is_file() else 0
+        if not results.is_file() and following <= number:
+            outcomes.append((script, f"start {number} left no results; see {script}.{number}.log"))
+        number = following if following > number else 0
+    return outcomes
 
 
 def make_scene(blender: Blender, script: str, outcomes: list[tuple[str, str]]) -> Path:
