@@ -31,6 +31,7 @@ from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
+from ..prt_addon.blender.stored_report import store_report
 from ..prt_addon.blender.visibility import find_objects, render_visible_objects
 from ..prt_addon.errors import BadScene, StorageError
 from ..prt_addon.lighting.light_cloud import free_space
@@ -173,6 +174,7 @@ class BakeSession:
         names = list(result.objects)
         for scene_object, name in zip(find_objects(names, scene), names, strict=True):
             write_baked(scene_object, result.objects[name], self.digests[name], self.surroundings)
+        store_report(scene, result.report)
         return result
 
     def discard(self) -> None:

@@ -68,3 +68,15 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
     return Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
                {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()},
                tuple(dict.fromkeys(warnings)))
+
+
+def draw_lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], lit: Lit, width: int, height: int,
+             background: NDArray[np.float32] | None = None, samples: int = 2) -> NDArray[np.float32]:
+    """The active camera's picture of all of them, through the viewport's shaders: as `offscreen.draw_items` gives it,
+    which also says what is raised."""
+    from ..gpu_shaders import offscreen  # a machine without a graphics driver can do all else
+    from ..gpu_shaders.render_data import DrawItem
+
+    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name])  # small: what moved is refused
+             for name, b in baked.items()]
+    return offscreen.draw_items(scene, items, width, height, background, samples)

@@ -51,6 +51,12 @@ class BakeProcess:
     job: the folder made by `job.write_job`. The result is left in it; read it after a "done" message.
     """
 
+    # What a process of another kind (blender/ground_truth.py) calls otherwise.
+    subject = "Bake"
+    remedy = "The previous bake is untouched; bake again to resume"
+    memory_remedy = "Choose a lower order, fewer directions, lights or objects and bake again to resume"
+    cancel_remedy = "Bake again to resume where it stopped"
+
     def __init__(self, python_command: list[str], job: Path) -> None:
         self.python_command = list(python_command)
         self.job = Path(job)
@@ -67,18 +73,17 @@ class BakeProcess:
 
     def start(self) -> None:
         """Start the child. PRTError when Python itself can't be started."""
-        command = [*self.python_command, str(WORKER), str(self.job), "--site", _wheels_folder()]
         messages: IO[bytes]
         with open(self.job / MESSAGE_FILE, "wb") as messages, open(self.job / ERROR_FILE, "wb") as errors:
-            try:
-                self.process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=messages, stderr=errors, env=_environment(),
-                    creationflags=_creation_flags(),
-                )
-            except OSError as error:
-                raise PRTError(
-                    "Bake process", f"Python could not be started ({error})", "Check the Blender installation"
-                ) from error
+            self._spawn([*self.python_command, str(WORKER), str(self.job), "--site", _wheels_folder()], messages, errors)
+
+    def _spawn(self, command: list[str], output: IO[bytes], errors: IO[bytes]) -> None:
+        try:
+            self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=errors,
+                                            env=_environment(), creationflags=_creation_flags())
+        except OSError as error:
+            raise PRTError(f"{self.subject} process", f"{Path(command[0]).name} could not be started ({error})",
+                           "Check the Blender installation") from error
 
     def poll(self) -> list[Message]:
         """The messages since the last call; never waits. The last one of a bake is "done" or "error"."""
@@ -139,19 +144,16 @@ class BakeProcess:
         """The message for a child that ended without saying why."""
         code = self.returncode
         if self._cancelled:
-            return error_message(Cancelled("Bake", "cancelled", "Bake again to resume where it stopped"))
+            return error_message(Cancelled(self.subject, "cancelled", self.cancel_remedy))
         last = _last_line(self.job / ERROR_FILE)
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
-            cause = f"the bake process was ended by signal {name}"
+            cause = f"its process was ended by signal {name}"
         else:
-            cause = f"the bake process ended with status {code}" + (f" ({last})" if last else "")
+            cause = f"its process ended with status {code}" + (f" ({last})" if last else "")
         if code == -9:
             cause += ", most often because memory ran out"
-            remedy = "Choose a lower order, fewer directions, lights or objects and bake again to resume"
-        else:
-            remedy = "The previous bake is untouched; bake again to resume"
-        return error_message(PRTError("Bake", cause, remedy))
+        return error_message(PRTError(self.subject, cause, self.memory_remedy if code == -9 else self.remedy))
 
 
 def error_message(error: PRTError) -> Message:
