@@ -9,10 +9,15 @@ from .operators import commands, live_preview, properties
 from .operators.analyze import PRT_OT_analyze
 from .operators.bake import PRT_OT_bake, PRT_OT_cancel
 from .operators.clear import PRT_OT_clear
+from .operators.compare import PRT_OT_compare
+from .operators.draw_camera import PRT_OT_draw_camera
+from .operators.export import PRT_OT_export
 from .operators.job_mixin import JobMixin
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
+from .operators.report import PRT_OT_show_report, PRT_OT_write_report
 from .panels.bake import PRT_PT_bake
+from .panels.check import PRT_PT_check
 from .panels.lamp import PRT_PT_lamp
 from .panels.preview import PRT_PT_preview
 from .panels.properties_editor import PRT_PT_object, PRT_PT_world
@@ -29,6 +34,11 @@ CLASSES = (
     PRT_OT_clear,
     PRT_OT_toggle_preview,
     PRT_OT_relight,
+    PRT_OT_draw_camera,
+    PRT_OT_compare,
+    PRT_OT_export,
+    PRT_OT_write_report,
+    PRT_OT_show_report,
     PRT_PT_bake,
     PRT_PT_rays,
     PRT_PT_highlights,
@@ -36,6 +46,7 @@ CLASSES = (
     PRT_PT_compression,
     PRT_PT_preview,
     PRT_PT_results,
+    PRT_PT_check,
     PRT_PT_lamp,
     PRT_PT_object,
     PRT_PT_world,

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.baking.settings import make_settings, parse_overrides
 from . import live_preview
-from .bake_session import BakeSession, baked_message, chosen_targets
+from .arguments import settings_of, targets_of
+from .bake_session import BakeSession, baked_message
 from .job_mixin import JobMixin
 
 
@@ -19,6 +19,18 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
     bl_label = "Bake Light Transfer"
     bl_options = {"UNDO"}
 
+    preset: bpy.props.StringProperty(
+        name="Preset", options={"HIDDEN", "SKIP_SAVE"},
+        description="draft, standard or high, in place of all of the panel's settings; empty takes the panel's",
+    )
+    lighting: bpy.props.StringProperty(
+        name="Lighting", options={"HIDDEN", "SKIP_SAVE"},
+        description="environment, local or environment,local; empty takes the panel's",
+    )
+    objects: bpy.props.StringProperty(
+        name="Objects", options={"HIDDEN", "SKIP_SAVE"},
+        description="Names of the objects to bake, with commas between; empty takes those that the panel says",
+    )
     overrides: bpy.props.StringProperty(
         name="Overrides", options={"HIDDEN", "SKIP_SAVE"},
         description="Any setting by name, as --set of the command line takes it: \"directions=4096, vectors=12\". "
@@ -39,9 +51,8 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
         return True
 
     def start_job(self, context: bpy.types.Context) -> BakeSession:
-        settings = make_settings(context.scene.prt.preset,
-                                 context.scene.prt.overrides() | parse_overrides(self.overrides))
-        return BakeSession.start(context.evaluated_depsgraph_get(), settings, chosen_targets(context.scene))
+        settings = settings_of(context.scene, self.preset, self.lighting, self.overrides)
+        return BakeSession.start(context.evaluated_depsgraph_get(), settings, targets_of(context.scene, self.objects))
 
     def finish_job(self, context: bpy.types.Context, job: BakeSession) -> str:
         result = job.store()

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.blender.comparison_sheet import comparison_sheet
-from ..prt_addon.blender.ground_truth import RenderProcess, read_render, start_render
+from ..prt_addon.blender.ground_truth import RenderProcess, parts_of, read_render, start_render
 from ..prt_addon.blender.pictures import Picture, read_picture
 from ..prt_addon.blender.stored_report import stored_report
 from ..prt_addon.errors import BadArguments, StorageError
@@ -63,7 +63,8 @@ class CompareSession:
         """Draw the preview, size (width, height), and let Cycles begin. Raises PRTError."""
         if not 2 <= samples <= MOST_SAMPLES:
             raise BadArguments("samples", f"{samples} can't be halved or is too much", f"Give 2 to {MOST_SAMPLES}")
-        samples += samples % 2
+        parts = parts_of(samples)
+        samples = -(-samples // parts) * parts
         baked = read_all(scene, scene.name)
         lit = relit(scene, baked, window=_window(scene))
         draw_lit(scene, baked, lit, 8, 8)  # shaders are compiled and data is loaded once, not for every picture
@@ -125,7 +126,7 @@ def _notes(scene: bpy.types.Scene, headers: dict[str, dict]) -> list[str]:
             notes.append(f"{name}: baked without bounced light")
     with contextlib.suppress(StorageError):  # the report is not what is compared
         notes += [f"Left out of the bake: {item['what']}, because {item['why']}"
-                  for item in (stored_report(scene) or {"left_out": ()})["left_out"]]
+                  for item in (stored_report(scene) or {"left_out": ()})["left_out"] if "material" in item["what"]]
     if _window(scene):
         notes.append("Soften Ringing is on: the preview's light is softer than the scene's")
     lost = [image.name for image in bpy.data.images if image.is_dirty and image.packed_file is None

@@ -30,6 +30,7 @@ STAGES = {
     "subsurface": "Light through bodies",
     "encode": "Compressing",
     "errors": "Measuring the error",
+    "cycles": "Rendering with Cycles",
 }
 
 
@@ -40,15 +41,17 @@ def progress_text(message: Message) -> str:
 
 
 class JobMixin:
-    """Base of operators whose work is a BakeSession.
+    """Base of operators whose work is a BakeSession, or another job with such a `process`.
 
-    A subclass gives `start_job(context) -> BakeSession`, which raises PRTError for bad input, and
+    A subclass gives `start_job(context) -> job`, which raises PRTError for bad input, and
     `finish_job(context, job) -> str`, which stores the result and returns what to tell the user.
     """
 
     # One job at a time; on the class, because Blender makes a new operator instance per call and `prt.cancel` asks.
     running: ClassVar[BakeSession | None] = None
     cancel_requested: ClassVar[bool] = False
+    subject: ClassVar[str] = "Bake"
+    cancel_remedy: ClassVar[str] = "Bake again to resume where it stopped"
     _timer: bpy.types.Timer | None = None
 
     @classmethod
@@ -104,7 +107,7 @@ class JobMixin:
         under_way = False
         try:
             if job is None or JobMixin.cancel_requested:
-                raise Cancelled("Bake", "cancelled, nothing was changed", "Bake again to resume where it stopped")
+                raise Cancelled(self.subject, "cancelled, nothing was changed", self.cancel_remedy)
             for message in job.process.poll()[-1:]:  # the last says it all: it alone can be an end
                 self._show(context, message)
             under_way = not job.process.finished

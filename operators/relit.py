@@ -70,6 +70,17 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
                tuple(dict.fromkeys(warnings)))
 
 
+def radiance_arrays(baked: dict[str, BakedTransfer], lit: Lit) -> dict[str, NDArray]:
+    """What `prt relight` writes: radiance, position, normal, albedo (points, 3) float32 and object (points,) text."""
+    return {
+        "radiance": np.concatenate([lit.radiance(name, b) for name, b in baked.items()]).astype(np.float32),
+        "position": np.concatenate([b.positions for b in baked.values()]),
+        "normal": np.concatenate([b.normals for b in baked.values()]),
+        "albedo": np.concatenate([b.albedo for b in baked.values()]),
+        "object": np.concatenate([np.full(len(b.cluster), name) for name, b in baked.items()]),
+    }
+
+
 def draw_lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], lit: Lit, width: int, height: int,
              background: NDArray[np.float32] | None = None, samples: int = 2) -> NDArray[np.float32]:
     """The active camera's picture of all of them, through the viewport's shaders: as `offscreen.draw_items` gives it,

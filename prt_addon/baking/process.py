@@ -75,7 +75,8 @@ class BakeProcess:
         """Start the child. PRTError when Python itself can't be started."""
         messages: IO[bytes]
         with open(self.job / MESSAGE_FILE, "wb") as messages, open(self.job / ERROR_FILE, "wb") as errors:
-            self._spawn([*self.python_command, str(WORKER), str(self.job), "--site", _wheels_folder()], messages, errors)
+            command = [*self.python_command, str(WORKER), str(self.job), "--site", _wheels_folder()]
+            self._spawn(command, messages, errors)
 
     def _spawn(self, command: list[str], output: IO[bytes], errors: IO[bytes]) -> None:
         try:

@@ -17,7 +17,7 @@ TICKS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 def comparison_sheet(drawn: Picture, rendered: Picture, difference: Picture, limit: float,
                      captions: tuple[str, str, str]) -> Picture:
-    """The three pictures (h, w, 3) side by side, a caption under each, and a scale of -limit to limit under the last."""
+    """The three pictures (h, w, 3) side by side, captions under them; under the last its scale, -limit to limit."""
     factor = max(1, -(-LEAST_WIDTH // drawn.shape[1]))
     pictures = [picture.repeat(factor, axis=0).repeat(factor, axis=1) for picture in (drawn, rendered, difference)]
     height, width, _ = pictures[0].shape

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import re
 import shutil
 import sys
 import time
@@ -26,10 +25,8 @@ from types import ModuleType
 import bpy
 import numpy as np
 
-SAMPLE = re.compile(r"Sample (\d+)/(\d+)")
 BOUNCES = 64  # the bake follows light until it is lost; Blender's defaults end it after four
 MASK_SHARE = 0.05  # of the progress
-PASSES = ("half_0", "half_1")
 
 
 def load_worker() -> ModuleType:
@@ -100,30 +97,17 @@ def render(scene: bpy.types.Scene, path: Path, samples: int, seed: int) -> np.nd
     return pixels[::-1]
 
 
-def follow(first: float, share: float) -> None:
-    """From now on, tell how far the render is: `first` of all work is done, this one is `share` of it."""
-    started = time.monotonic()
-
-    def tell(text: str, *_: object) -> None:
-        found = SAMPLE.search(text) if isinstance(text, str) else None
-        if found is None:
-            return
-        done = int(found[1]) / int(found[2])
-        left = (time.monotonic() - started) / done * (1.0 - first - share * done) / share if done > 0.05 else None
-        worker.emit("progress", stage="cycles", fraction=first + share * done, rays=0, seconds_left=left)
-
-    bpy.app.handlers.render_stats[:] = [tell]
-    worker.emit("progress", stage="cycles", fraction=first, rays=0, seconds_left=None)
-
-
-def render_halves(scene: bpy.types.Scene, job: Path, samples: int, seed: int) -> dict[str, np.ndarray]:
-    """Two pictures of half the samples each, whose difference is the noise."""
-    share, started, found = (1.0 - MASK_SHARE) / len(PASSES), time.perf_counter(), {}
-    for number, name in enumerate(PASSES):
-        follow(MASK_SHARE + number * share, share)
-        found[name] = render(scene, job / f"{name}.exr", samples // len(PASSES), seed + number)
-    bpy.app.handlers.render_stats.clear()
-    return found | {"seconds": np.array(time.perf_counter() - started)}
+def render_halves(scene: bpy.types.Scene, job: Path, samples: int, parts: int, seed: int) -> dict[str, np.ndarray]:
+    """Two pictures of half the samples each, whose difference is the noise. They are rendered in several parts, as
+    Cycles without a window says nothing of how far a render is."""
+    started, halves = time.perf_counter(), [0.0, 0.0]
+    for number in range(parts):
+        halves[number % 2] += render(scene, job / "part.exr", samples // parts, seed + number) / (parts // 2)
+        taken, done = time.perf_counter() - started, (number + 1) / parts
+        worker.emit("progress", stage="cycles", fraction=MASK_SHARE + (1.0 - MASK_SHARE) * done, rays=0,
+                    seconds_left=taken / done * (1.0 - done))
+    return {"half_0": np.float32(halves[0]), "half_1": np.float32(halves[1]),
+            "seconds": np.array(time.perf_counter() - started)}
 
 
 def render_mask(scene: bpy.types.Scene, job: Path, names: list[str]) -> dict[str, np.ndarray]:
@@ -174,7 +158,8 @@ def run(job: Path) -> int:
         scene = open_copy(job, request)
         prepare_render(scene, *request["size"])
         found = render_mask(scene, job, request["objects"])
-        found |= render_halves(scene, job, request["samples"], request["seed"])
+        worker.emit("progress", stage="cycles", fraction=MASK_SHARE, rays=0, seconds_left=None)
+        found |= render_halves(scene, job, request["samples"], request["parts"], request["seed"])
         with open(job / "result.part", "wb") as stream:
             np.savez(stream, **found)
         (job / "result.part").replace(job / "result.npz")
