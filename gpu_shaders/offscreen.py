@@ -242,6 +242,7 @@ def _png_settings(scene: bpy.types.Scene, color_mode: str) -> Iterator[None]:
         "color_management": "FOLLOW_SCENE",
     }
     before = {name: getattr(settings, name) for name in wanted if hasattr(settings, name)}
+    space = settings.linear_colorspace_settings.name  # Blender sets it along with the format
     try:
         for name in before:
             setattr(settings, name, wanted[name])
@@ -249,3 +250,5 @@ def _png_settings(scene: bpy.types.Scene, color_mode: str) -> Iterator[None]:
     finally:
         for name, value in before.items():
             setattr(settings, name, value)
+        if space:
+            settings.linear_colorspace_settings.name = space

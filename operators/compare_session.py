@@ -63,8 +63,7 @@ class CompareSession:
         """Draw the preview, size (width, height), and let Cycles begin. Raises PRTError."""
         if not 2 <= samples <= MOST_SAMPLES:
             raise BadArguments("samples", f"{samples} can't be halved or is too much", f"Give 2 to {MOST_SAMPLES}")
-        parts = parts_of(samples)
-        samples = -(-samples // parts) * parts
+        parts, samples = parts_of(samples)
         baked = read_all(scene, scene.name)
         lit = relit(scene, baked, window=_window(scene))
         draw_lit(scene, baked, lit, 8, 8)  # shaders are compiled and data is loaded once, not for every picture
@@ -75,7 +74,7 @@ class CompareSession:
         layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
         names = list(baked)
         notes = [*_notes(scene, {name: b.header for name, b in baked.items()}), *lit.warnings]
-        process = start_render(scene, layer, names, size, samples)
+        process = start_render(scene, layer, names, size, parts, samples)
         return CompareSession(process, scene.name, names, drawn, samples, seconds, list(dict.fromkeys(notes)))
 
     def finish(self) -> Compared:
@@ -125,8 +124,11 @@ def _notes(scene: bpy.types.Scene, headers: dict[str, dict]) -> list[str]:
         if header.get("settings", {}).get("bounces") == 0:
             notes.append(f"{name}: baked without bounced light")
     with contextlib.suppress(StorageError):  # the report is not what is compared
-        notes += [f"Left out of the bake: {item['what']}, because {item['why']}"
-                  for item in (stored_report(scene) or {"left_out": ()})["left_out"] if "material" in item["what"]]
+        report = stored_report(scene) or {"left_out": (), "stages": ()}
+        notes += [f"Left out of the bake: {item['what']}, because {item['why']}" for item in report["left_out"]
+                  if "material" in item["what"]]  # the rest costs no light
+        if any(stage["name"] == "subsurface" for stage in report["stages"]):
+            notes.append("Light through bodies is diffusion here and a random walk in Cycles: thin parts differ")
     if _window(scene):
         notes.append("Soften Ringing is on: the preview's light is softer than the scene's")
     lost = [image.name for image in bpy.data.images if image.is_dirty and image.packed_file is None

@@ -22,12 +22,13 @@ from ..baking.process import ERROR_FILE, MESSAGE_FILE, BakeProcess, Message
 from ..errors import PRTError, StorageError
 
 WORKER = Path(__file__).with_name("cycles_worker.py")
-MOST_PARTS = 8  # of a render, for its progress: each costs the start of one
+MOST_PARTS = 6  # of a render, for its progress: each costs the start of one
 
 
-def parts_of(samples: int) -> int:
-    """In how many renders, an even number, so many samples are taken."""
-    return max(2, min(MOST_PARTS, samples // 8 // 2 * 2))
+def parts_of(samples: int) -> tuple[int, int]:
+    """In how many renders, an even number, about so many samples are taken; and how many these are in all."""
+    parts = max(2, min(MOST_PARTS, samples // 16 * 2))
+    return parts, -(-samples // parts) * parts
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,9 @@ class RenderProcess(BakeProcess):
 
 
 def start_render(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, names: list[str], size: tuple[int, int],
-                 samples: int, seed: int = 0) -> RenderProcess:
-    """Begin to render the active camera's view, size (width, height), with so many samples (a multiple of
-    `parts_of` them) in each pixel.
+                 parts: int, samples: int, seed: int = 0) -> RenderProcess:
+    """Begin to render the active camera's view, size (width, height), with so many samples in each pixel, in so many
+    parts (`parts_of`).
 
     names: of the objects that `GroundTruth.objects` tells apart. Poll the result until it is finished, then
     `read_render` it. Raises PRTError where Cycles is missing, StorageError where the copy can't be written.
@@ -98,7 +99,7 @@ def start_render(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, names:
     try:
         bpy.ops.wm.save_as_mainfile(filepath=str(job / "scene.blend"), copy=True, check_existing=False, compress=False)
         request = {"scene": scene.name, "view_layer": view_layer.name, "objects": names, "size": list(size),
-                   "samples": samples, "parts": parts_of(samples), "seed": seed}
+                   "samples": samples, "parts": parts, "seed": seed}
         (job / "request.json").write_text(json.dumps(request), "utf-8")
         process = RenderProcess(_blender(), job)
         process.start()
