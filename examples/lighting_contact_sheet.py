@@ -27,7 +27,7 @@ ENDINGS = {".exr", ".hdr"}
 def sky_files(given: list[Path]) -> list[Path]:
     """The pictures among the files and folders given, or Blender's own."""
     if not given:
-        given = [Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world"]
+        given = [Path(bpy.utils.system_resource("DATAFILES", path="studiolights/world"))]
     found = [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
     return [file.resolve() for file in found if file.suffix.lower() in ENDINGS]
 
