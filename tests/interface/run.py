@@ -31,6 +31,7 @@ SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
+    "compare": ("compare_in_blender.py", "make_scene.py"),
 }
 COMMAND_SECONDS = 240
 
