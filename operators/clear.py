@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.blender.stored import baked_objects, clear_baked
+from ..prt_addon.blender.stored import baked_objects, clear_baked, clear_orphans
 from ..prt_addon.blender.stored_report import clear_report
 from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError
@@ -46,6 +46,8 @@ class PRT_OT_clear(bpy.types.Operator):
                 clear_baked(baked_object)
             if len(chosen) == len(baked):
                 clear_report(context.scene)
+            if chosen is baked:
+                clear_orphans(context.scene)
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

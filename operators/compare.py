@@ -5,26 +5,21 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.blender.pictures import show_image, store_image, write_picture
 from ..prt_addon.blender.stored import baked_mesh
-from ..prt_addon.storage.files import save_json
 from .arguments import path_of, size_in, size_of
-from .compare_session import CompareSession
+from .compare_session import CompareRequest
 from .job_mixin import JobMixin
-from .properties import assign, session
-
-IMAGE = "PRT Comparison"
+from .place import Place
 
 
 class PRT_OT_compare(JobMixin, bpy.types.Operator):
     """Render the camera's view under the present light with Cycles, beside Blender, and compare the preview with it.
-    Costs about as much as that render; your file, its settings and the last render stay as they are"""
+    Costs about as much as that render; your file, its settings and the last render stay as they are.
+    While a bake runs, it waits for it"""
 
     bl_idname = "prt.compare"
     bl_label = "Compare with Cycles"
-
-    subject = "Compare"
-    cancel_remedy = "Compare again when you like"
+    bl_options = {"UNDO"}  # a bake may have its turn after it, and be followed by the same operator
 
     samples: bpy.props.IntProperty(
         name="Samples", min=0, options={"SKIP_SAVE"},
@@ -42,9 +37,6 @@ class PRT_OT_compare(JobMixin, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if JobMixin.running is not None:
-            cls.poll_message_set("Something is being baked or compared: wait for its end, or cancel it")
-            return False
         if context.mode != "OBJECT":
             cls.poll_message_set("Leave edit mode first: the bakes can't be read in it")
             return False
@@ -56,19 +48,10 @@ class PRT_OT_compare(JobMixin, bpy.types.Operator):
             return False
         return True
 
-    def start_job(self, context: bpy.types.Context) -> CompareSession:
+    def make_request(self, context: bpy.types.Context) -> CompareRequest:
+        """The camera's view of this scene, with the panel's settings where no others are given."""
         settings = context.scene.prt
         size = size_of(self.size) if self.size else size_in(context.scene, settings.compare_percentage)
-        return CompareSession.start(context.scene, size, self.samples or settings.compare_samples)
-
-    def finish_job(self, context: bpy.types.Context, job: CompareSession) -> str:
-        compared = job.finish()
-        shown = show_image(store_image(IMAGE, compared.picture))
-        if self.filepath:
-            write_picture(path_of(self.filepath), compared.picture)
-        if self.report_path:
-            save_json(path_of(self.report_path), compared.result)
-        lines = compared.lines
-        where = "" if shown else f"The picture is the image \"{IMAGE}\": open an Image Editor to see it"
-        assign(session(context), comparison="\n".join([*lines, *([where] if where else [])]))
-        return lines[0]
+        return CompareRequest(Place.of(context), size, self.samples or settings.compare_samples,
+                              path_of(self.filepath) if self.filepath else None,
+                              path_of(self.report_path) if self.report_path else None)

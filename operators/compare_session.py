@@ -12,7 +12,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 import numpy as np
@@ -20,16 +20,20 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.comparison_sheet import comparison_sheet
 from ..prt_addon.blender.ground_truth import RenderProcess, parts_of, read_render, start_render
-from ..prt_addon.blender.pictures import Picture, read_picture
+from ..prt_addon.blender.pictures import Picture, read_picture, show_image, store_image, write_picture
 from ..prt_addon.blender.stored_report import stored_report
-from ..prt_addon.errors import BadArguments, StorageError
+from ..prt_addon.errors import BadArguments, BadScene, StorageError
 from ..prt_addon.reporting.comparison import compare, comparison_lines, false_colours, inner_pixels
 from ..prt_addon.reporting.svg_plots import percent
+from ..prt_addon.storage.files import save_json
+from .place import Place
+from .properties import assign, session
 from .relit import draw_lit, read_all, relit
 
 DRAWN_SAMPLES = 4  # of the preview, per pixel and axis: edges within objects as smooth as those of the render
 BEHIND = (0.05, 0.05, 0.05)  # what both pictures stand on, scene-linear: the sky does not count
 MOST_SAMPLES = 2 ** 16
+IMAGE = "PRT Comparison"
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,38 @@ class Compared:
         return comparison_lines(self.result) + self.result["notes"]
 
 
+@dataclass(frozen=True)
+class CompareRequest:
+    """One press on Compare, until its turn comes. size: (width, height); picture, report: files to write, or None."""
+
+    place: Place
+    size: tuple[int, int]
+    samples: int
+    picture: Path | None = None
+    report: Path | None = None
+    title: ClassVar[str] = "Comparison with Cycles"
+
+    def start(self) -> CompareSession:
+        """Draw the preview and let Cycles begin. Raises PRTError."""
+        scene = self.place.find()
+        layer = scene.view_layers.get(self.place.view_layer) or scene.view_layers[0]
+        with bpy.context.temp_override(scene=scene, view_layer=layer):
+            job = CompareSession.start(scene, self.size, self.samples)
+        job.picture, job.report = self.picture, self.report
+        return job
+
+    def object_in_use(self) -> str | None:
+        """An object of the scene that is in edit mode: its bake can't be read."""
+        try:
+            return next((o.name for o in self.place.find().objects if o.mode == "EDIT"), None)
+        except BadScene:
+            return None  # `start` says it
+
+
 @dataclass
 class CompareSession:
-    """A comparison under way: poll `process` until it is finished, then `finish`. drawn: (h, w, 4), scene-linear."""
+    """A comparison under way: poll `process` until it is finished, then `finish` or `conclude` it. drawn: (h, w, 4),
+    scene-linear; remarks: what is not compared like with like; picture, report: files to write, or None."""
 
     process: RenderProcess
     scene_name: str
@@ -56,7 +89,11 @@ class CompareSession:
     drawn: NDArray[np.float32]
     samples: int
     preview_seconds: float
-    notes: list[str]
+    remarks: list[str]
+    picture: Path | None = None
+    report: Path | None = None
+    notes: tuple[str, ...] = ()  # nothing of what the artist did meanwhile counts
+    writes_bakes: ClassVar[bool] = False
 
     @staticmethod
     def start(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> CompareSession:
@@ -71,11 +108,36 @@ class CompareSession:
         draw_lit(scene, baked, lit, *size)
         seconds = time.perf_counter() - started
         drawn = draw_lit(scene, baked, lit, *size, samples=DRAWN_SAMPLES)
-        layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
         names = list(baked)
-        notes = [*_notes(scene, {name: b.header for name, b in baked.items()}), *lit.warnings]
-        process = start_render(scene, layer, names, size, parts, samples)
-        return CompareSession(process, scene.name, names, drawn, samples, seconds, list(dict.fromkeys(notes)))
+        remarks = [*_remarks(scene, {name: b.header for name, b in baked.items()}), *lit.warnings]
+        process = start_render(scene, bpy.context.view_layer, names, size, parts, samples)
+        return CompareSession(process, scene.name, names, drawn, samples, seconds, list(dict.fromkeys(remarks)))
+
+    def conclude(self) -> str:
+        """`finish`, show the picture and write the files asked for; what to tell the user. Raises PRTError."""
+        compared = self.finish()
+        shown = show_image(store_image(IMAGE, compared.picture))
+        if self.picture is not None:
+            write_picture(self.picture, compared.picture)
+        if self.report is not None:
+            save_json(self.report, compared.result)
+        where = [] if shown else [f"The picture is the image \"{IMAGE}\": open an Image Editor to see it"]
+        assign(session(), comparison="\n".join([*compared.lines, *where]))
+        return compared.lines[0]
+
+    def object_in_use(self) -> None:
+        """Nothing that could be in edit mode is written."""
+
+    def end(self, _state: str) -> None:
+        """It was cancelled or failed."""
+        self.close()
+
+    def close(self) -> None:
+        """End the child if it lives. May be called twice."""
+        self.process.cancel()
+
+    def file_saved(self) -> None:
+        """The copy that is rendered has a name of its own."""
 
     def finish(self) -> Compared:
         """Read what Cycles left, and compare. Call it after the "done" message. Raises StorageError."""
@@ -88,7 +150,7 @@ class CompareSession:
         height, width, _ = rendered.shape
         result = compare(self.drawn[..., :3], truth.halves, truth.objects, inner, self.names)
         result |= {"size": [width, height], "cycles": {"samples": truth.samples, "seconds": truth.seconds},
-                   "preview_seconds": self.preview_seconds, "notes": self.notes}
+                   "preview_seconds": self.preview_seconds, "notes": self.remarks}
         difference, limit = false_colours(self.drawn[..., :3], rendered, inner)
         scene = bpy.data.scenes.get(self.scene_name, bpy.context.scene)
         pictures = (displayed(scene, self.drawn[..., :3], self.drawn[..., 3:]),
@@ -117,7 +179,7 @@ def _window(scene: bpy.types.Scene) -> bool:
     return bool(getattr(getattr(scene, "prt", None), "window", False))
 
 
-def _notes(scene: bpy.types.Scene, headers: dict[str, dict]) -> list[str]:
+def _remarks(scene: bpy.types.Scene, headers: dict[str, dict]) -> list[str]:
     """What Cycles shows and these bakes, by design, do not."""
     notes = []
     for name, header in headers.items():

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
-from ..prt_addon.blender.stored import baked_objects, read_baked, stale
+from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import BadScene
 from ..prt_addon.relighting.exit_radiance import view_radiance
+from ..prt_addon.relighting.moved_light import distant_light_in, moved_normals, moved_points
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .scene_lamps import SceneLamps
@@ -22,11 +23,12 @@ from .scene_lamps import SceneLamps
 
 @dataclass(frozen=True)
 class Lit:
-    """By name of the baked object: light in its columns, and direct light of lamps (None for none); warnings for the
-    user, each once."""
+    """By name of the baked object: light in its columns, and direct light of lamps (None for none), both as the bake
+    sees them; moved: (4, 4) from where it was baked to where it is now; warnings for the user, each once."""
 
     light: dict[str, NDArray[np.float32]]
     direct: dict[str, NDArray[np.float32] | None]
+    moved: dict[str, NDArray[np.float64]]
     warnings: tuple[str, ...]
 
     def radiance(self, name: str, baked: BakedTransfer) -> NDArray[np.float32]:
@@ -62,20 +64,24 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
         found = light_coefficients(scene, depsgraph, order, environment, rotate, use_scene_lights, window,
                                    all(b.cloud is None for b in baked.values()))
         distant, warnings = found.coefficients, list(found.warnings)
+    moved = {name: transform_since_bake(scene.objects[name], b.header) for name, b in baked.items()}
     scene_lamps = SceneLamps()
-    lamps = scene_lamps.step(baked, depsgraph, warnings) if use_scene_lights else []
-    local = {name: scene_lamps.cloud_light(b) if lamps else None for name, b in baked.items()}
-    return Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
-               {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()},
-               tuple(dict.fromkeys(warnings)))
+    lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
+    light, direct = {}, {}
+    for name, b in baked.items():
+        seen = None if distant is None else distant_light_in(distant, moved[name])
+        light[name] = joined_light(b.lighting_basis, seen, scene_lamps.cloud_light(b, moved[name]) if lamps else None)
+        direct[name] = scene_lamps.direct(name, b, lamps, moved=moved[name]) if lamps else None
+    return Lit(light, direct, moved, tuple(dict.fromkeys(warnings)))
 
 
 def radiance_arrays(baked: dict[str, BakedTransfer], lit: Lit) -> dict[str, NDArray]:
     """What `prt relight` writes: radiance, position, normal, albedo (points, 3) float32 and object (points,) text."""
+    moved = lit.moved
     return {
-        "radiance": np.concatenate([lit.radiance(name, b) for name, b in baked.items()]).astype(np.float32),
-        "position": np.concatenate([b.positions for b in baked.values()]),
-        "normal": np.concatenate([b.normals for b in baked.values()]),
+        "radiance": np.concatenate([lit.radiance(n, b) for n, b in baked.items()]).astype(np.float32),
+        "position": np.concatenate([moved_points(b.positions, moved[n]) for n, b in baked.items()]).astype(np.float32),
+        "normal": np.concatenate([moved_normals(b.normals, moved[n]) for n, b in baked.items()]).astype(np.float32),
         "albedo": np.concatenate([b.albedo for b in baked.values()]),
         "object": np.concatenate([np.full(len(b.cluster), name) for name, b in baked.items()]),
     }
@@ -88,6 +94,5 @@ def draw_lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], lit: Lit, 
     from ..gpu_shaders import offscreen  # a machine without a graphics driver can do all else
     from ..gpu_shaders.render_data import DrawItem
 
-    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name])  # small: what moved is refused
-             for name, b in baked.items()]
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name]) for name, b in baked.items()]
     return offscreen.draw_items(scene, items, width, height, background, samples)

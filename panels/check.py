@@ -19,7 +19,6 @@ class PRT_PT_check(Sidebar, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         column = layout.column()
-        column.enabled = not session.running
         column.prop(settings, "compare_samples")
         column.prop(settings, "compare_percentage")
         column.operator("prt.compare", icon="CAMERA_STEREO")

@@ -54,14 +54,15 @@ class RenderProcess(BakeProcess):
     subject = "Compare"
     remedy = "Nothing was changed; check that a render with Cycles works"
     memory_remedy = "Choose a smaller size"
-    cancel_remedy = "Nothing was changed"
+    lost_remedy = "Compare again, and leave the folder alone"
+    cancel_remedy = "Compare again when you like"
     done = False
 
     def start(self) -> None:
         """Start the child. PRTError when Blender can't be started once more."""
         (self.job / MESSAGE_FILE).touch()  # the child appends to it: stdout has Blender's own chatter
         with open(self.job / ERROR_FILE, "wb") as chatter:
-            self._spawn([*self.python_command, str(WORKER), "--", str(self.job)], chatter, chatter)
+            self._start([*self.python_command, str(WORKER), "--", str(self.job)], chatter, chatter)
 
     def poll(self) -> list[Message]:
         """See `BakeProcess.poll`."""

@@ -77,8 +77,6 @@ def compare_without_an_editor() -> Step:
     before, render_results = settings_of(scene), [i.name for i in bpy.data.images if i.type == "RENDER_RESULT"]
     assert invoke_compare() == {"RUNNING_MODAL"}
     assert session().running and len(children()) == 1
-    with override():
-        assert not bpy.ops.prt.compare.poll() and not bpy.ops.prt.bake.poll()
     yield from wait_for_bake("c01_comparing")
     assert not session().failed, session().message
     assert session().message.startswith("Difference "), session().message
