@@ -33,7 +33,7 @@ from .panels.lamp import PRT_PT_lamp
 from .panels.light_presets import PRT_PT_light_animation, PRT_PT_light_presets, PRT_PT_lights
 from .panels.preview import PRT_PT_preview
 from .panels.properties_editor import PRT_PT_object, PRT_PT_world
-from .panels.results import PRT_PT_results
+from .panels.results import PRT_PT_last_bake, PRT_PT_results
 from .panels.settings import PRT_PT_compression, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_rays
 
 CLASSES = (
@@ -68,6 +68,7 @@ CLASSES = (
     PRT_PT_lights,
     PRT_PT_light_animation,
     PRT_PT_results,
+    PRT_PT_last_bake,
     PRT_PT_check,
     PRT_PT_lamp,
     PRT_PT_object,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from typing import ClassVar
 
 import bpy
@@ -33,10 +33,13 @@ from ..prt_addon.blender.stored import (
     stale,
     transform_since_bake,
 )
+from ..prt_addon.blender.stored_report import PROPERTY as REPORT_PROPERTY
+from ..prt_addon.blender.stored_report import read_stored_report
 from ..prt_addon.errors import PRTError
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.moved_light import distant_light_in, is_turned
 from ..prt_addon.relighting.scene_light import joined_light
+from ..prt_addon.reporting.summary import summary
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
@@ -317,7 +320,8 @@ def _read_bakes() -> None:
 def _tell_panel() -> None:
     """Pass on to the panel what is known of the scene of this context."""
     state = session()
-    assign(state, cloud="\n".join(_cloud_lines()), preview_message=_live.message if state.preview else "")
+    assign(state, cloud="\n".join(_cloud_lines()), preview_message=_live.message if state.preview else "",
+           last_bake=_last_bake(bpy.context.scene.get(REPORT_PROPERTY, "")) if _live.lines else "")
     if [line.name for line in state.objects] != [line.name for line in _live.lines]:
         state.objects.clear()
         for line in _live.lines:
@@ -326,6 +330,16 @@ def _tell_panel() -> None:
         # Blender keeps floats in single precision.
         assign(told, **{name: float(np.float32(value)) if isinstance(value, float) else value
                         for name, value in vars(line).items()})
+
+
+@lru_cache(maxsize=4)
+def _last_bake(text: str) -> str:
+    """The report of the scene's last bake as lines of kind, share and words for the panel; empty without a report."""
+    try:
+        report = read_stored_report(text, "the report")
+    except PRTError:
+        return ""  # the buttons that show it say what is wrong
+    return "\n".join(f"{line.kind}\t{line.share:.3f}\t{line.text}" for line in summary(report)) if report else ""
 
 
 def _cloud_lines() -> list[str]:
