@@ -38,7 +38,7 @@ IMAGE = "PRT Comparison"
 
 @dataclass(frozen=True)
 class Compared:
-    """What came out: `result` as a report (see `comparison.compare`, with cycles, preview_seconds, size and notes), its
+    """What came out: `result` as a report (see `comparison.compare`, with cycles, preview_seconds, size, remarks), its
     lines for a person, and the picture."""
 
     result: dict[str, Any]
@@ -47,7 +47,7 @@ class Compared:
     @property
     def lines(self) -> list[str]:
         """The numbers in words, then what is not compared like with like."""
-        return comparison_lines(self.result) + self.result["notes"]
+        return comparison_lines(self.result) + self.result["remarks"]
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class CompareSession:
         height, width, _ = rendered.shape
         result = compare(self.drawn[..., :3], truth.halves, truth.objects, inner, self.names)
         result |= {"size": [width, height], "cycles": {"samples": truth.samples, "seconds": truth.seconds},
-                   "preview_seconds": self.preview_seconds, "notes": self.remarks}
+                   "preview_seconds": self.preview_seconds, "remarks": self.remarks}
         difference, limit = false_colours(self.drawn[..., :3], rendered, inner)
         scene = bpy.data.scenes.get(self.scene_name, bpy.context.scene)
         pictures = (displayed(scene, self.drawn[..., :3], self.drawn[..., 3:]),
@@ -181,19 +181,19 @@ def _window(scene: bpy.types.Scene) -> bool:
 
 def _remarks(scene: bpy.types.Scene, headers: dict[str, dict]) -> list[str]:
     """What Cycles shows and these bakes, by design, do not."""
-    notes = []
+    found = []
     for name, header in headers.items():
         if header.get("settings", {}).get("bounces") == 0:
-            notes.append(f"{name}: baked without bounced light")
+            found.append(f"{name}: baked without bounced light")
     with contextlib.suppress(StorageError):  # the report is not what is compared
         report = stored_report(scene) or {"left_out": (), "stages": ()}
-        notes += [f"Left out of the bake: {item['what']}, because {item['why']}" for item in report["left_out"]
+        found += [f"Left out of the bake: {item['what']}, because {item['why']}" for item in report["left_out"]
                   if "material" in item["what"]]  # the rest costs no light
         if any(stage["name"] == "subsurface" for stage in report["stages"]):
-            notes.append("Light through bodies is diffusion here and a random walk in Cycles: thin parts differ")
+            found.append("Light through bodies is diffusion here and a random walk in Cycles: thin parts differ")
     if _window(scene):
-        notes.append("Soften Ringing is on: the preview's light is softer than the scene's")
+        found.append("Soften Ringing is on: the preview's light is softer than the scene's")
     lost = [image.name for image in bpy.data.images if image.is_dirty and image.packed_file is None
             and image.users and image.type == "IMAGE"]
-    notes += [f"{name}: its unsaved changes are not in the render" for name in lost]
-    return notes
+    found += [f"{name}: its unsaved changes are not in the render" for name in lost]
+    return found
