@@ -90,7 +90,7 @@ def test_a_small_memory_budget_changes_nothing_and_leaves_no_file(tmp_path):
     for name, container in small.objects.items():
         other = large.objects[name]
         assert np.array_equal(container.weights, other.weights) and np.array_equal(container.bases, other.bases)
-    assert {path.name for path in tmp_path.iterdir()} == {"gather.npz"}
+    assert {path.name for path in tmp_path.iterdir()} - {"stages.json"} == {"gather.npz"}
 
 
 def test_a_stopped_bake_goes_on_after_its_last_stage(baked, tmp_path):
