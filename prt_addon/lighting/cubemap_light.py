@@ -127,7 +127,7 @@ class Turn:
 
     As Nowrouzezahrai et al. (2007), section 5, the lattice turned by the inverse rotation looks the light up
     bilinearly, across the faces' edges. That alone misses or doubles a light of one texel, since texels differ in size
-    (its flux is off by up to 100 %: benchmarks/eigentransport.py --turns). So the weights are the mean of that look-up
+    (0 to 2.2 times its flux is left: benchmarks/eigentransport.py --turns). So the weights are the mean of that look-up
     and of the reverse, where each source texel spreads its flux around the place that it turns to, evened out by
     alternate scaling of both sides (Sinkhorn 1964): every source's flux arrives in full, and constants stay constant.
     """
