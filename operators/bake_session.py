@@ -195,9 +195,10 @@ class BakeSession:
         """Its job folder."""
         return self.claim.folder
 
-    @property
-    def seconds(self) -> float:
-        """Since the start, reading the scene included."""
+    def seconds(self, result: BakeResult) -> float:
+        """Since the start, reading the scene included; of a bake that was complete before, what it took then."""
+        if isinstance(self.process, CompletedBake):
+            return float(result.report["seconds"])
         return time.monotonic() - self.started
 
     def store(self) -> BakeResult:

@@ -254,7 +254,7 @@ class JobMixin:
         job.close()
         self.stored = True
         live_preview.bakes_changed()
-        text = ". ".join([baked_message(result, job.seconds), *job.notes])
+        text = ". ".join([baked_message(result, job.seconds(result)), *job.notes])
         assign(session(context), message=text, failed=False)
         self.report({"WARNING" if job.notes else "INFO"}, text)
 
