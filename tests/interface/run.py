@@ -31,6 +31,7 @@ SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
     "faults": ("faults_in_blender.py", "make_scene.py"),
+    "losses": ("losses_in_blender.py", "make_scene.py"),
     "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
     "presets": ("presets_in_blender.py", "make_scene.py"),
