@@ -122,7 +122,7 @@ def move_one() -> Step:
     ball.location.x += 0.4
     undo_push("moved")
     yield from becomes_stale(*BAKED)
-    yield from check_view("c10_one_moved", BAKED)
+    yield from check_view("c10_one_moved", {"Floor", "Wall"})
     with override():
         bpy.ops.ed.undo()
     yield from becomes_stale()
@@ -216,7 +216,7 @@ def duplicate() -> Step:
         bpy.data.objects["Ball.001"].location.x -= 1.0
         select()
         yield from until(lambda: stale_names() == {*BAKED, "Ball.001"}, f"stale are {stale_names()}")
-        yield from check_view(f"c23_duplicate_{linked}", {*BAKED, "Ball.001"})
+        yield from check_view(f"c23_duplicate_{linked}", BAKED)
         bpy.data.objects.remove(bpy.data.objects["Ball.001"])
         yield from until(lambda: baked_names() == BAKED and not stale_names(), f"stale are {stale_names()}")
     yield from check_view("c24_without_copies", BAKED)
