@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ..prt_addon.blender.stored import baked_mesh
+from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError, StorageError
 from .properties import session
 from .relit import read_all, relit
@@ -38,14 +39,15 @@ class PRT_OT_relight(bpy.types.Operator):
         try:
             baked = read_all(scene, scene.name)
             lit = relit(scene, baked, window=scene.prt.window)
+            objects = dict(zip(baked, find_objects(list(baked), scene), strict=True))
             for name, transfer in baked.items():
-                write_colours(baked_mesh(scene.objects[name]), lit.radiance(name, transfer))
+                write_colours(baked_mesh(objects[name]), lit.radiance(name, transfer))
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         for warning in lit.warnings:
             self.report({"WARNING"}, warning)
-        carriers = [name for name in baked if baked_mesh(scene.objects[name]) != scene.objects[name].data]
+        carriers = [name for name in baked if baked_mesh(objects[name]) != objects[name].data]
         text = f"Lit {len(baked)} object{'' if len(baked) == 1 else 's'}"
         if carriers:
             text += f"; of {', '.join(carriers)} the attribute is on the hidden receiver mesh"
