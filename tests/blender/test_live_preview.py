@@ -49,7 +49,7 @@ def follow() -> live_preview.Live:
     """Everything that the timer would do, with what the handlers would have noted."""
     depsgraph()
     live = live_preview._lives.setdefault(live_preview._context_key(), live_preview.Live())
-    live.light_dirty = live.stale_dirty = True
+    live.light_dirty = live.stale_dirty = live.list_dirty = True
     live.stale_due = 0.0
     live_preview._follow()
     live_preview._tell_panel()
