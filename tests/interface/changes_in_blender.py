@@ -151,7 +151,7 @@ def edit_what_counts() -> Step:
     ball, wall, post = (bpy.data.objects[name] for name in ("Ball", "Wall", "Post"))
     changes: tuple[tuple[str, Callable[[], object], Callable[[], object]], ...] = (
         ("modifier", lambda: ball.modifiers.new("Cast", "CAST"), lambda: ball.modifiers.clear()),
-        ("mesh", lambda: shift(wall, 0.1), lambda: shift(wall, -0.1)),
+        ("mesh", lambda: lift(wall, 0.1), lambda: lift(wall, 0.0)),
         ("material", lambda: paint(wall, 0.1), lambda: paint(wall, 0.8)),
         ("material of another", lambda: paint(post, 0.9), lambda: paint(post, 0.1)),
     )
@@ -178,8 +178,8 @@ def edit_what_counts() -> Step:
     yield from check_view("c13_all_back", BAKED)
 
 
-def shift(scene_object: bpy.types.Object, distance: float) -> None:
-    scene_object.data.vertices[0].co.z += distance
+def lift(scene_object: bpy.types.Object, height: float) -> None:
+    scene_object.data.vertices[0].co.z = height
     scene_object.data.update()
 
 
