@@ -54,6 +54,7 @@ OUTSIDE_LABEL = "outside the light cloud: no bounced light"
 OUTLINES = ("BOUNDS", "WIRE")
 SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 SURFACE_DATA = (bpy.types.Material, bpy.types.Mesh)
+UNLISTED = ("LIGHT", "CAMERA")  # objects that hold no bake
 LISTED_TYPES = (bpy.types.Object, bpy.types.Scene, bpy.types.Collection)
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
@@ -117,6 +118,7 @@ class Live:
     stale_seconds: float = 0.0
     stale_due: float = 0.0
     bakes_dirty: bool = True
+    list_dirty: bool = True  # objects may have come or gone
     light_dirty: bool = True
     stale_dirty: bool = True
     working: ClassVar[bool] = False
@@ -512,9 +514,10 @@ def _follow() -> float | None:
     """Do for the scene of this context what is to be done; the seconds until there is more."""
     now = time.perf_counter()
     try:
-        if _live.bakes_dirty or _live.known != _known(_bakes_here()):
+        if _live.bakes_dirty or (_live.list_dirty and _live.known != _known(_bakes_here())):
             _live.light_dirty = True
             _read_bakes()
+        _live.list_dirty = False
         if _live.stale_dirty and now >= _live.stale_due:
             _read_stale()
         if _live.light_dirty and session().preview:
@@ -542,11 +545,11 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 
 def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     """Note what a depsgraph's updates may have changed. light: whether that has changed for certain."""
-    geometry, asked, reshaped = False, light, False
+    geometry = asked = reshaped = False
     for update in depsgraph.updates:
         changed = update.id
         reshaped |= update.is_updated_geometry
-        asked |= isinstance(changed, LISTED_TYPES)
+        asked |= isinstance(changed, LISTED_TYPES) and getattr(changed, "type", "") not in UNLISTED
         if isinstance(changed, LIGHT_TYPES):
             light = True
         elif isinstance(changed, bpy.types.Object):
@@ -557,6 +560,7 @@ def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     now = time.perf_counter()
     for live in _lives.values():
         live.light_dirty |= light
+        live.list_dirty |= asked
         live.geometry += reshaped
         if geometry and not live.stale_dirty:
             live.stale_dirty, live.stale_due = True, now + max(STALE_WAIT, 4.0 * live.stale_seconds)
