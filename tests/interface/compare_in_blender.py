@@ -109,6 +109,18 @@ def compare_in_an_editor() -> Step:
     shoot("c03_in_an_image_editor")
 
 
+def queue() -> Step:
+    """Asked for while a bake runs, it waits, and compares what that bake stored."""
+    scene = bpy.context.scene
+    scene.prt.preset, scene.prt.compare_percentage = "draft", 25.0
+    assert invoke_bake() == {"RUNNING_MODAL"}
+    invoke_compare()
+    assert session().waiting == "Comparison with Cycles", session().waiting
+    yield from wait_for_bake()
+    assert session().message.startswith("Difference ") and "Baked " in session().ended, session().message
+    assert f"of {160 * 100:,} pixels".replace(",", "\u202f") in session().comparison, session().comparison
+
+
 def cancel() -> Step:
     """Esc and the panel's button end it within a second, with the last result still there."""
     before = session().comparison
@@ -151,6 +163,7 @@ def report_and_export() -> Step:
         assert bpy.ops.prt.export(directory=str(OUTPUT / "export")) == {"FINISHED"}
         assert bpy.ops.prt.write_report(filepath=str(OUTPUT / "report_ui.html")) == {"FINISHED"}
         assert bpy.ops.prt.write_report(filepath=str(OUTPUT / "report_ui.json")) == {"FINISHED"}
+        assert bpy.ops.prt.show_report() == {"FINISHED"}
     index = json.loads((OUTPUT / "export" / "baked.json").read_text())
     assert {entry["name"] for entry in index["objects"]} == {"Statue", "Floor", "Wall"}
     assert "<html" in (OUTPUT / "report_ui.html").read_text()[:400].lower()
@@ -164,6 +177,6 @@ def report_and_export() -> Step:
     assert (OUTPUT / "again.json").read_bytes() == (OUTPUT / "report_ui.json").read_bytes()
 
 
-STEPS = (open_scene, compare_without_an_editor, compare_in_an_editor, cancel, report_and_export)
+STEPS = (open_scene, compare_without_an_editor, compare_in_an_editor, queue, cancel, report_and_export)
 
 start(STEPS, "compare")
