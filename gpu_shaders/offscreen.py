@@ -99,7 +99,18 @@ def draw_items(
     Raises BadArguments for a size that does not fit, BadScene for a camera or a light that does not, PRTError without
     a graphics driver.
     """
-    view_projection = camera_view_projection(scene, width, height)
+    return draw_view(items, camera_view_projection(scene, width, height), width, height, background, samples)
+
+
+def draw_view(
+    items: Sequence[DrawItem],
+    view_projection: NDArray[np.float64],
+    width: int,
+    height: int,
+    background: ArrayLike | None = None,
+    samples: int = 2,
+) -> NDArray[np.float32]:
+    """As `draw_items`, seen through any (4, 4) from world to clip space."""
     prepare_gpu()
     samples = max(1, min(samples, LARGEST_TEXTURE // max(width, height)))
     cache = DrawingCache()
@@ -170,7 +181,14 @@ def camera_background(
 
     sample: radiance (n, 3) of unit world directions (n, 3) that point away from the camera.
     """
-    inverse = np.linalg.inv(camera_view_projection(scene, width, height))  # small
+    return view_background(camera_view_projection(scene, width, height), sample, width, height)
+
+
+def view_background(
+    view_projection: NDArray[np.float64], sample: Callable[[NDArray[np.float64]], ArrayLike], width: int, height: int
+) -> NDArray[np.float32]:
+    """As `camera_background`, seen through any (4, 4) from world to clip space."""
+    inverse = np.linalg.inv(view_projection)  # small
     columns = (np.arange(width) + 0.5) / width * 2.0 - 1.0
     rows = 1.0 - (np.arange(height) + 0.5) / height * 2.0
     # A pixel's points on the near and far planes are affine in its place; far - near is its direction, for
@@ -219,6 +237,12 @@ def write_png(path: Path, picture: NDArray[np.floating], scene: bpy.types.Scene)
 
     Fully opaque pictures become RGB. The file is complete or absent. Raises StorageError where it can't be written.
     """
+    content = png_bytes(picture, scene)
+    write_atomically(path, lambda stream: stream.write(content) and None)
+
+
+def png_bytes(picture: NDArray[np.floating], scene: bpy.types.Scene) -> bytes:
+    """A scene-linear picture (height, width, 4), row 0 up, as an 8 bit PNG with the scene's view transform."""
     height, width, _ = picture.shape
     image = bpy.data.images.new("PRT preview", width, height, alpha=True, float_buffer=True)
     try:
@@ -227,10 +251,9 @@ def write_png(path: Path, picture: NDArray[np.floating], scene: bpy.types.Scene)
         with tempfile.TemporaryDirectory() as folder, _png_settings(scene, "RGB" if opaque else "RGBA"):
             beside = Path(folder) / "preview.png"
             image.save_render(str(beside), scene=scene)
-            content = beside.read_bytes()
+            return beside.read_bytes()
     finally:
         bpy.data.images.remove(image)
-    write_atomically(path, lambda stream: stream.write(content) and None)
 
 
 @contextlib.contextmanager

@@ -344,6 +344,7 @@ class PRTSession(bpy.types.PropertyGroup):
     objects: CollectionProperty(type=PRTBakedObject)
     cloud: StringProperty()
     analysis: StringProperty()
+    last_bake: StringProperty()
     comparison: StringProperty()
 
 

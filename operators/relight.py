@@ -88,15 +88,19 @@ class PRT_OT_relight(bpy.types.Operator):
 def write_colours(mesh: bpy.types.Mesh, radiance: np.ndarray) -> None:
     """Put radiance (points, 3) into the attribute, which is made where it is missing. Raises StorageError where
     something else has its name."""
-    if mesh.library is not None:
-        raise StorageError(mesh.name, "it is linked from another file", "Make it local")
-    attribute = mesh.attributes.get(ATTRIBUTE)
-    if attribute is None:
-        attribute = mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
-    if (attribute.name, attribute.data_type, attribute.domain) != (ATTRIBUTE, "FLOAT_COLOR", "POINT"):
-        raise StorageError(mesh.name, f"an attribute named {ATTRIBUTE} of another kind is in the way",
-                           "Rename or remove it")
+    check_free(mesh)
+    attribute = mesh.attributes.get(ATTRIBUTE) or mesh.color_attributes.new(ATTRIBUTE, "FLOAT_COLOR", "POINT")
     colours = np.ones((len(radiance), 4), np.float32)
     colours[:, :3] = radiance
     attribute.data.foreach_set("color", colours.ravel())
     mesh.update_tag()
+
+
+def check_free(mesh: bpy.types.Mesh) -> None:
+    """Raises StorageError where the attribute can't be written."""
+    if mesh.library is not None:
+        raise StorageError(mesh.name, "it is linked from another file", "Make it local")
+    attribute = mesh.attributes.get(ATTRIBUTE)
+    if attribute is not None and (attribute.data_type, attribute.domain) != ("FLOAT_COLOR", "POINT"):
+        raise StorageError(mesh.name, f"an attribute named {ATTRIBUTE} of another kind is in the way",
+                           "Rename or remove it")

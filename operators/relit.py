@@ -55,8 +55,12 @@ def read_all(scene: bpy.types.Scene, subject: str) -> dict[str, BakedTransfer]:
 
 
 def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: Path | None = None,
-          rotate: float = 0.0, use_scene_lights: bool = True, window: bool = False) -> Lit:
-    """The light of the scene on its bakes; arguments as those of `light_coefficients`."""
+          rotate: float = 0.0, use_scene_lights: bool = True, window: bool = False,
+          scene_lamps: SceneLamps | None = None) -> Lit:
+    """The light of the scene on its bakes; arguments as those of `light_coefficients`.
+
+    scene_lamps: kept by the caller from one light to the next, who tells it when geometry changes.
+    """
     depsgraph = bpy.context.evaluated_depsgraph_get()
     order = max(b.lighting_basis.order for b in baked.values())
     distant, warnings = None, []
@@ -65,7 +69,7 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
                                    all(b.cloud is None for b in baked.values()))
         distant, warnings = found.coefficients, list(found.warnings)
     moved = {name: transform_since_bake(scene.objects[name], b.header) for name, b in baked.items()}
-    scene_lamps = SceneLamps()
+    scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
     light, direct = {}, {}
     for name, b in baked.items():

@@ -25,16 +25,20 @@ def store_report(scene: bpy.types.Scene, report: dict[str, Any]) -> None:
 
 def stored_report(scene: bpy.types.Scene) -> dict[str, Any] | None:
     """The report of the scene's last bake; None without one. Raises StorageError where it was tampered with."""
-    text = scene.get(PROPERTY)
-    if text is None:
+    return read_stored_report(scene.get(PROPERTY), scene.name)
+
+
+def read_stored_report(text: object, scene_name: str) -> dict[str, Any] | None:
+    """The report that a property's value holds; None where it is missing or empty. Raises StorageError."""
+    if text is None or text == "":
         return None
     try:
         report = json.loads(text)
     except (TypeError, ValueError) as error:
-        raise StorageError(scene.name, "the report of its last bake is no JSON text", "Bake again") from error
+        raise StorageError(scene_name, "the report of its last bake is no JSON text", "Bake again") from error
     problem = problem_of(report)
     if problem is not None:
-        raise StorageError(scene.name, f"the report of its last bake is not readable ({problem})", "Bake again")
+        raise StorageError(scene_name, f"the report of its last bake is not readable ({problem})", "Bake again")
     return report
 
 
