@@ -124,7 +124,7 @@ class CompareSession:
             save_json(self.report, compared.result)
         where = [] if shown else [f"The picture is the image \"{IMAGE}\": open an Image Editor to see it"]
         assign(session(), comparison="\n".join([*compared.lines, *where]))
-        return compared.lines[0]
+        return f"Compared with Cycles: {compared.lines[0][0].lower()}{compared.lines[0][1:]}"
 
     def object_in_use(self) -> None:
         """Nothing that could be in edit mode is written."""

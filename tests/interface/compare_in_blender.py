@@ -79,12 +79,14 @@ def compare_without_an_editor() -> Step:
     assert session().running and len(children()) == 1
     yield from wait_for_bake("c01_comparing")
     assert not session().failed, session().message
-    assert session().message.startswith("Difference "), session().message
+    assert session().message.startswith("Compared with Cycles: difference "), session().message
     assert "open an Image Editor" in session().comparison, session().comparison
     assert bpy.data.images[IMAGE].size[0] > 3 * 320 and not bpy.data.images[IMAGE].is_dirty
     assert settings_of(scene) == before
     assert [i.name for i in bpy.data.images if i.type == "RENDER_RESULT"] == render_results
     assert not children()
+    box = region("UI")  # the panel is at the end of the sidebar
+    subprocess.run(["xdotool", "mousemove", str(box.x + 60), "500", *["click", "5"] * 40], check=True)
     yield DRAWN
     shoot("c02_compared")
 
@@ -117,7 +119,7 @@ def queue() -> Step:
     invoke_compare()
     assert session().waiting == "Comparison with Cycles", session().waiting
     yield from wait_for_bake()
-    assert session().message.startswith("Difference ") and "Baked " in session().ended, session().message
+    assert session().message.startswith("Compared with Cycles: difference ") and "Baked " in session().ended, session().message
     assert f"of {160 * 100:,} pixels".replace(",", "\u202f") in session().comparison, session().comparison
 
 
