@@ -119,7 +119,8 @@ def queue() -> Step:
     invoke_compare()
     assert session().waiting == "Comparison with Cycles", session().waiting
     yield from wait_for_bake()
-    assert session().message.startswith("Compared with Cycles: difference ") and "Baked " in session().ended, session().message
+    assert session().message.startswith("Compared with Cycles: difference "), session().message
+    assert "Baked " in session().ended, session().ended
     assert f"of {160 * 100:,} pixels".replace(",", "\u202f") in session().comparison, session().comparison
 
 
