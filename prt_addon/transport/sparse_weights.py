@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..linear_algebra import small_batched_multiply
+from ..linear_algebra import many_symmetric_eigenpairs, small_batched_multiply
 
 Array = NDArray[np.float64]
 Method = Literal["l1", "least_squares", "radius"]
@@ -28,7 +28,7 @@ Method = Literal["l1", "least_squares", "radius"]
 STEPS, RELAXATION, PENALTY, PENALTY_BY_STRENGTH = 60, 1.7, 0.05, 1.5
 # Of the mean eigenvalue, added to the diagonal where a Gram matrix is inverted as it is: it decides between equal
 # neighbours without changing what they add up to.
-RIDGE = 1e-9
+RIDGE = 1e-5
 # Of the sparsest strength, at which every weight is zero: the default of `solve`.
 STRENGTH = 1e-3
 # The part of the radius below which distances count as equal.
@@ -49,6 +49,13 @@ class Normal:
         right = small_batched_multiply(features, samples[:, :, None])[:, :, 0]
         gram = small_batched_multiply(features, features.transpose(0, 2, 1))
         return Normal(gram.astype(np.float64), right.astype(np.float64))
+
+    def adding_up(self, samples: float) -> Normal:
+        """With one more sample, of the weight of so many: where all neighbours are 1, so is the vertex. Without it the
+        penalty on |w|_1 makes weights add up to less than 1 and vertices too dark. A slot without neighbour stays
+        empty."""
+        there = (np.diagonal(self.gram, axis1=1, axis2=2) > 0.0) * samples
+        return Normal(self.gram + there[:, :, None] * (there[:, None, :] > 0.0), self.right + there)
 
     @property
     def size(self) -> Array:
@@ -120,3 +127,8 @@ def inverted(matrices: Array, ridge: Array) -> Array:
         row[:, pivot] = over[:, 0]
         result[:, pivot] = row
     return result
+
+
+def eigenvalues(matrices: Array) -> Array:
+    """Eigenvalues, descending (n, k), of symmetric matrices (n, k, k)."""
+    return many_symmetric_eigenpairs(matrices)[0]
