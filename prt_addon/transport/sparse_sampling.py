@@ -45,10 +45,10 @@ class SparseSettings:
     """dense: share of dense vertices; rounds: in which they are chosen, the first at random; features: samples of a
     sparse vertex as a share of the columns (350 of 6,144); radius: within which neighbours are looked for, as a share
     of the scene's diagonal; neighbours: most of them; normals: distance in radii that opposite normals count as;
-    method: how neighbours are weighed; strength: of `sparse_weights.solve`; adding_up: of `Normal.adding_up`, in
-    multiples of the samples (measured on a ground plane at strength 0.001: none leaves light 4 % too dark, 0.3 1.1 %,
-    3 and more 0.5 %); most: share of all elements that may be asked for, dense vertices are left out beyond it; seed:
-    of the random choice."""
+    method: how neighbours are weighed; strength: of `sparse_weights.solve`; adding_up: of `Normal.adding_up`, for
+    direct light (measured on a ground plane at strength 0.001: none leaves light 4 % too dark, 3 0.7 %, 20 0.5 %);
+    most: share of all elements that may be asked for, dense vertices are left out beyond it; seed: of the random
+    choice."""
 
     dense: float = 0.25
     rounds: int = 5
@@ -58,7 +58,7 @@ class SparseSettings:
     normals: float = 1.0
     method: sparse_weights.Method = "l1"
     strength: float = sparse_weights.STRENGTH
-    adding_up: float = 3.0
+    adding_up: float = 8.0
     most: float = 1.0
     seed: int = 0
 
@@ -316,7 +316,9 @@ def _weights(scene: _Scene, found: Places, distances: NDArray[np.float64], chose
         values = np.concatenate([scene.rows.values[rows], np.zeros((1, scene.elements.columns), np.float32)])
         features = values[local[:, :, None], chosen[part][:, None, :]]
         features *= worth[part][:, None, :]
-        normal = Normal.of(features, samples[part]).adding_up(scene.settings.adding_up * chosen.shape[1])
+        normal = Normal.of(features, samples[part])
+        if scene.elements.angular:  # indirect light may be brighter than all neighbours'
+            normal = normal.adding_up(scene.settings.adding_up)
         solved = sparse_weights.solve(normal, scene.settings.strength) if scene.settings.method == "l1" else \
             sparse_weights.least_squares(normal)
         told = worth[part].any(axis=1)

@@ -153,10 +153,10 @@ def test_a_vertex_like_its_neighbour_takes_it():
 def test_adding_up_keeps_the_brightness_that_the_penalty_takes():
     features, samples = visibility_like(20, 24, 200, seed=4)
     normal = Normal.of(features, samples)
-    plain, added = (sparse_weights.solve(n, 0.01).sum(axis=1) for n in (normal, normal.adding_up(600)))
+    plain, added = (sparse_weights.solve(n, 0.01).sum(axis=1) for n in (normal, normal.adding_up(8.0)))
     assert np.abs(added - 1).mean() < 0.3 * np.abs(plain - 1).mean()
     features[0, 5:] = 0.0
-    assert not sparse_weights.solve(Normal.of(features, samples).adding_up(600))[0, 5:].any()
+    assert not sparse_weights.solve(Normal.of(features, samples).adding_up(8.0))[0, 5:].any()
 
 
 def test_results_do_not_depend_on_the_batch():
