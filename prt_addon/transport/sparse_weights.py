@@ -51,7 +51,7 @@ class Normal:
         return Normal(gram.astype(np.float64), right.astype(np.float64))
 
     def adding_up(self, samples: float) -> Normal:
-        """With one more sample, of the weight of so many times the neighbours' own: where all neighbours have one value,
+        """With one more sample that weighs so many times the neighbours' own: where all neighbours have one value,
         so has the vertex. Without it the penalty on |w|_1 makes weights add up to less than 1 and vertices too dark. A
         slot without neighbour stays empty."""
         there = (np.diagonal(self.gram, axis1=1, axis2=2) > 0.0) * (samples * self.size)[:, None]
