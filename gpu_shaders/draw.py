@@ -14,7 +14,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
-from ..prt_addon.relighting.exit_radiance import cluster_constants
+from ..prt_addon.relighting.exit_radiance import baked_constants
 from . import programs
 from .render_data import (
     DrawItem,
@@ -177,7 +177,7 @@ class DrawingCache:
         if self._lights.get(item.key) != light:
             if item.heat is None:
                 coefficients = matching_light(item.light, drawing.data.columns)
-                drawing.relight(cluster_constants(item.baked.bases, coefficients, item.baked.cluster_zone))
+                drawing.relight(baked_constants(item.baked, coefficients))
             else:
                 drawing.show_colours(heat_colours(item.heat))
             self._lights[item.key] = light

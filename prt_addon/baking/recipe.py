@@ -645,7 +645,7 @@ class _Bake:
         sample = HighlightSample(keys, rows, compressed, self.surfaces.functions, *self._objects_of(keys))
         return (yield from self._follow("errors", highlight_budget(
             surfaces, sample, self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
-            int(self.glossy_bounce), settings.error_paths, settings.seed), 0.5, 1.0))
+            int(self.glossy_bounce), settings.error_paths, settings.seed, settings.glossy_window), 0.5, 1.0))
 
     def _local_errors(self, encodings: dict[str, Encoding]) -> Generator[Progress, None, dict[str, Any]]:
         """The error budget of lamps' bounced light."""
