@@ -204,9 +204,11 @@ def encoders(name: str, arguments: argparse.Namespace) -> None:
         places = scene.positions(part)
         joins = np.flatnonzero(found.dense)[KDTree(places[found.dense]).query(places)[1]]
         settings = EncoderSettings(clusters, 24, threads=arguments.threads, restarts=0)
+        print(f"{name} {part}: sampled", flush=True)
         started = time.perf_counter()
         first = encode_dense_first(signal, found.dense, joins, settings)
         between = time.perf_counter()
+        print(f"dense first {between - started:.1f} s, {100 * first.relative_error ** 0.5:.2f} %", flush=True)
         whole = encode(signal, settings)
         ended = time.perf_counter()
         rows.append([f"{name} {part}", clusters, between - started, ended - between,
