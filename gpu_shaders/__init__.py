@@ -9,6 +9,7 @@ Reading order is data order:
     programs.py      GLSL files -> the programs (cached; released by `programs.release`).
     draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
                      when the data's signature changes, relit when the light's changes, else only drawn.
+    occluders.py     depth of surfaces that are not ours, where Blender leaves none.
     viewport.py      the two draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
     offscreen.py     `draw_camera` for background mode and the bpy wheel, `write_png`.
 
@@ -16,6 +17,7 @@ The GLSL:
 
     texel_layout.glsl          where value i of a long list lies in a 2D texture (prepended to readers of one)
     exit_radiance.comp.glsl    once per light change: exit radiance of every point and row, into a texture
+    depth.vert/frag.glsl       surfaces that only hide others
     surface.vert.glsl          once per frame: fetches a point's exit radiance by gl_VertexID
     surface.frag.glsl          multiplies the interpolated radiance by the interpolated albedo
     view_surface.vert.glsl     the same for view-dependent transfer: all rows of the point, and its local view

@@ -17,7 +17,7 @@ Handlers do not run in final renders nor in viewport renders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,11 +31,13 @@ from mathutils import Vector
 from ..prt_addon.errors import PRTError
 from . import programs
 from .draw import DrawingCache
+from .occluders import Occluder, OccluderCache
 from .render_data import DrawItem
 
 SPACE = bpy.types.SpaceView3D
 GetDrawList = Callable[[], Sequence[DrawItem]]
 IsComplete = Callable[[], bool]
+GetOccluders = Callable[[], Sequence[Occluder]]
 
 
 GetLabels = Callable[[], Sequence[tuple[str, Sequence[float]]]]
@@ -44,6 +46,10 @@ LABEL_SIZE, LABEL_OFFSET = 12, (14, 10)  # in units of the interface's scale
 
 def _never_complete() -> bool:
     return False
+
+
+def _no_occluders() -> Sequence[Occluder]:
+    return ()
 
 
 def _no_labels() -> Sequence[tuple[str, Sequence[float]]]:
@@ -71,9 +77,12 @@ class _Viewport:
     get_draw_list: GetDrawList
     is_complete: IsComplete
     get_labels: GetLabels = _no_labels
+    get_occluders: GetOccluders = _no_occluders
+    occluders: OccluderCache = field(default_factory=OccluderCache)
     handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
     framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
+    drawn: dict[int, set[Hashable]] = field(default_factory=dict)  # keys of the last redraw by region
     status: ViewportStatus = field(default_factory=lambda: ViewportStatus(enabled=True))
 
 
@@ -81,19 +90,21 @@ _active: _Viewport | None = None
 
 
 def enable(get_draw_list: GetDrawList, is_complete: IsComplete = _never_complete,
-           get_labels: GetLabels = _no_labels) -> None:
+           get_labels: GetLabels = _no_labels, get_occluders: GetOccluders = _no_occluders) -> None:
     """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the callables change.
 
     get_draw_list runs on every redraw of every region, with bpy.context of that region: it must be cheap, and may
     raise PRTError, which `status()` then shows. is_complete runs after it and says whether the listed objects are the
     only visible surfaces of the region; then they hide each other by their own depth alone. get_labels runs on every
     redraw, too: short texts and the places in the world (3,) beside which they stand while overlays are shown.
+    get_occluders is asked where Blender leaves no depth: for what else is visible in the region and can be in front.
     """
     global _active
     if _active is not None:
-        _active.get_draw_list, _active.is_complete, _active.get_labels = get_draw_list, is_complete, get_labels
+        _active.get_draw_list, _active.is_complete = get_draw_list, is_complete
+        _active.get_labels, _active.get_occluders = get_labels, get_occluders
     else:
-        _active = _Viewport(get_draw_list, is_complete, get_labels)
+        _active = _Viewport(get_draw_list, is_complete, get_labels, get_occluders)
         for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW"),
                                (_draw_labels, "POST_PIXEL")):
             _active.handlers.append(SPACE.draw_handler_add(handler, (), "WINDOW", phase))
@@ -108,6 +119,7 @@ def disable() -> None:
     for handle in _active.handlers:
         SPACE.draw_handler_remove(handle, "WINDOW")
     _active.cache.clear()
+    _active.occluders.clear()
     _active = None
     programs.release()
     redraw()
@@ -148,11 +160,21 @@ def _draw_region() -> None:
         return
     try:
         items = viewport.get_draw_list()
-        viewport.cache.keep_only({item.key for item in items})
+        viewport.cache.keep_only(_keys_in_use(viewport, region, items))
         _draw_items(viewport, items, framebuffer)
         viewport.status.objects, viewport.status.error = len(items), ""
     except PRTError as error:  # nobody can catch it here; the panel shows it
         viewport.status.objects, viewport.status.error = 0, str(error)
+
+
+def _keys_in_use(viewport: _Viewport, region: bpy.types.Region, items: Sequence[DrawItem]) -> set[Hashable]:
+    """What this and the other open regions draw: one in local view, or of another scene, must not cost them theirs."""
+    windows = bpy.context.window_manager.windows if bpy.context.window_manager else ()
+    there = {other.as_pointer() for window in windows for area in window.screen.areas if area.type == "VIEW_3D"
+             for other in area.regions}
+    viewport.drawn = {pointer: keys for pointer, keys in viewport.drawn.items() if pointer in there}
+    viewport.drawn[region.as_pointer()] = {item.key for item in items}
+    return set().union(*viewport.drawn.values())
 
 
 def _draw_labels() -> None:
@@ -188,8 +210,11 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
         viewport.cache.draw(items, view_projection)
         return
     with framebuffer.bind():
-        if viewport.is_complete() or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
+        complete = viewport.is_complete()
+        if complete or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
             framebuffer.clear(depth=1.0)
+            if not complete:
+                viewport.occluders.draw(viewport.get_occluders(), view_projection)
         viewport.cache.draw(items, view_projection)
 
 
@@ -213,7 +238,7 @@ def _sees_through(shading: bpy.types.View3DShading) -> bool:
 
 
 def _depth_is_missing(space: bpy.types.SpaceView3D, engine: str) -> bool:
-    """Whether the picture's depth is not the scene's. Other objects then can't hide the baked ones.
+    """Whether the picture's depth is not the scene's, so that others have to be drawn into it.
 
     Workbench always writes it, other engines only for the overlays: without them EEVEE leaves 0 everywhere, so that
     nothing would pass, and Cycles 1.

@@ -22,6 +22,7 @@ from ..prt_addon.baking.settings import BakeSettings, make_settings
 from ..prt_addon.blender.lights import environment_picture
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.errors import BadArguments, StorageError
+from ..prt_addon.relighting.moved_light import moved_normals, moved_points
 from ..prt_addon.reporting.headline import headline
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
@@ -51,13 +52,13 @@ def bake(arguments: argparse.Namespace) -> Iterator[str]:
     session = BakeSession.start(bpy.context.evaluated_depsgraph_get(), settings, arguments.objects)
     try:
         _follow(session)
+        result = session.store()
+        save_blend(arguments.output)
+        if arguments.report is not None:
+            write_report(arguments.report, result.report)
+        session.discard()  # only now: until the file is saved, the finished stages are all there is
     finally:
-        session.process.cancel()
-    result = session.store()
-    save_blend(arguments.output)
-    if arguments.report is not None:
-        write_report(arguments.report, result.report)
-    session.discard()  # only now: until the file is saved, the finished stages are all there is
+        session.close()
     _tell(headline(result.report))
     yield str(arguments.output)
     if arguments.report is not None:
@@ -76,8 +77,8 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
     radiances = [lit.radiance(name, b) for name, b in baked.items()]
     save_arrays(arguments.output, {
         "radiance": np.concatenate(radiances).astype(np.float32),
-        "position": np.concatenate([b.positions for b in baked.values()]),
-        "normal": np.concatenate([b.normals for b in baked.values()]),
+        "position": np.concatenate([moved_points(b.positions, lit.moved[n]) for n, b in baked.items()]).astype("f4"),
+        "normal": np.concatenate([moved_normals(b.normals, lit.moved[n]) for n, b in baked.items()]).astype("f4"),
         "albedo": np.concatenate([b.albedo for b in baked.values()]),
         "object": np.concatenate([np.full(len(b.cluster), name) for name, b in baked.items()]),
     })
@@ -96,8 +97,7 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
     percentage = scene.render.resolution_percentage / 100.0
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
                                        max(1, round(scene.render.resolution_y * percentage)))
-    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name])  # small: what moved is refused
-             for name, b in baked.items()]
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name]) for name, b in baked.items()]
     background = None
     if not scene.render.film_transparent:
         sky, rotation = environment_picture(scene, bpy.context.evaluated_depsgraph_get(), arguments.environment,
