@@ -4,7 +4,7 @@
     python benchmarks/sparse_sampling.py PART [--scene horse,bunny,buddha] [--edge 32] [--threads 2]
 
 PART: direct (Figures 9, 10), radius (Figure 6), encode (Figure 11), indirect, glossy (Figure 20), pays (where it does).
-A scene is a model of the shared meshes on a ground plane of 29,241 vertices from -2 to 2, as the paper's; model and ground
+A scene is one of the shared meshes on a ground plane of 29,241 vertices from -2 to 2, as the paper's; model and ground
 are sampled and told apart. Light for errors: Blender's forest, sunset and city. docs/sparse_precomputation.md.
 """
 
