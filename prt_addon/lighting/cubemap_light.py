@@ -28,8 +28,8 @@ from .environment import direction_of_pixel
 
 Array = NDArray[np.float64]
 
-# Parts of a pixel are at most this share of the smallest texel wide: a texel has some 600 to 3,000 of them.
-_PART = 1.0 / 24.0
+# Parts of a pixel are at most this share of the smallest texel wide: a texel has some 150 to 750 of them.
+_PART = 1.0 / 12.0
 _MOST_PARTS = 64  # along a pixel: of pictures a few pixels wide
 _PIXELS_AT_ONCE = 1 << 18
 # Samples of a sun's disc for each texel that it covers, and at most.
@@ -43,7 +43,7 @@ def environment_texels(image: NDArray[np.floating], r: int, rotation: ArrayLike 
 
     Each pixel is cut into parts of equal azimuth and polar angle, much smaller than a texel, and a texel averages all
     parts whose middle lies in it, by their exact solid angles: a box filter, so nothing aliases, and a constant stays
-    one. The parts in a texel do not quite add up to its solid angle (1 %), so means times solid angles are not quite
+    one. The parts in a texel do not quite add up to its solid angle (2 %), so means times solid angles are not quite
     the image's flux; what is missing is shared by the texels in proportion to how much each may have lost, which gives
     a bright pixel back its own. rotation: R (3, 3) of the environment, f(R^-1 s).
     """
@@ -127,7 +127,7 @@ class Turn:
 
     As Nowrouzezahrai et al. (2007), section 5, the lattice turned by the inverse rotation looks the light up
     bilinearly, across the faces' edges. That alone misses or doubles a light of one texel, since texels differ in size
-    (its flux is off by up to 100 %: benchmarks/eigentransport.py --turns). So the weights are the mean of that look-up
+    (0 to 2.2 times its flux is left: benchmarks/eigentransport.py --turns). So the weights are the mean of that look-up
     and of the reverse, where each source texel spreads its flux around the place that it turns to, evened out by
     alternate scaling of both sides (Sinkhorn 1964): every source's flux arrives in full, and constants stay constant.
     """

@@ -32,6 +32,10 @@ Single = NDArray[np.float32]
 LEAST_DIRECTIONS = 6144
 
 
+# Of the tolerance that the sums of faces are bounced to: single texels' light dies out a little more slowly.
+PROBE = 0.5
+
+
 @dataclass(frozen=True)
 class _Task:
     """texels: of the columns; directions: (texels * samples, 3); weights: (texels * samples,) solid angle / pi; scale:
@@ -112,22 +116,34 @@ def bounced_columns(matrix: sparse.csr_matrix, albedo: Single, direct: Single, t
 
     matrix, albedo (receivers, channels), tolerance, bounces: of `interreflect`; direct: (columns, receivers). Result:
     (columns * channels, receivers) float32, a column's channels side by side, written block by block of `at_once`
-    columns, so that only a block's copies are in memory. tolerance: of each block. The report is of its hardest block.
+    columns, so that only a block's copies are in memory. How many bounces are enough is found on the sums of the faces'
+    columns, so that it does not depend on the blocks; where those need the Krylov solver, each block is solved by it to
+    the tolerance. The report is of all blocks together.
     """
     channels = albedo.shape[1]
     result = column_array(len(direct) * channels, direct.shape[1], budget, folder)
-    hardest: Interreflection | None = None
+    solved = yield from _scaled(interreflect(matrix, albedo, _face_sums(direct), PROBE * tolerance, bounces), 0.0, 0.02)
+    left = energy = 0.0
     for part in column_blocks(len(direct), at_once):
         block = np.ascontiguousarray(direct[part].T)
-        steps = interreflect(matrix, albedo, block, tolerance, bounces)
+        steps = interreflect(matrix, albedo, block, tolerance, solved.bounces)
         bounced = yield from _scaled(steps, part.start / len(direct), (part.stop - part.start) / len(direct))
         rows = slice(part.start * channels, part.stop * channels)
         result[rows] = bounced.transfer.reshape(len(block), -1).T
-        if hardest is None or bounced.steps > hardest.steps:
-            hardest = replace(bounced, transfer=np.empty((0, 0, channels), np.float32))
-    if hardest is None:
-        raise ValueError("there are no columns to bounce")
-    return result, hardest
+        squares = float(np.sum(np.square(block, dtype=np.float64)))
+        energy, left = energy + squares, left + squares * bounced.residual ** 2
+    residual = float(np.sqrt(left / energy)) if energy > 0.0 else 0.0
+    return result, replace(solved, transfer=np.empty((0, 0, channels), np.float32), residual=residual)
+
+
+def _face_sums(direct: Single) -> Single:
+    """(receivers, 6) of columns (6 r r, receivers): six lights that are each as wide as a face."""
+    whole = np.zeros((6, direct.shape[1]))
+    for part in column_blocks(len(direct)):
+        face = np.arange(part.start, part.stop) * 6 // len(direct)
+        for number in np.unique(face):
+            whole[number] += direct[part][face == number].sum(axis=0, dtype=np.float64)
+    return np.ascontiguousarray(whole.T, np.float32)
 
 
 def _scaled(steps: Generator[float, None, Interreflection], first: float, width: float,

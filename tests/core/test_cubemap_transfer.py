@@ -121,6 +121,18 @@ def test_bounces_in_blocks_are_those_of_all_columns_at_once(ball, ball_gather, t
         assert np.allclose(found.reshape(24, 3, -1).transpose(2, 0, 1), whole.transfer, atol=1e-7)
 
 
+@pytest.mark.parametrize("albedo", [0.4, 0.95])
+def test_bounces_end_where_little_is_left_whatever_the_blocks(ball, ball_gather, albedo):
+    _, tracer, _ = ball
+    receivers = ball_gather.receivers
+    direct = drain(cubemap_transfer(tracer, receivers, 2, 4))
+    colour = np.full((len(receivers), 1), albedo, np.float32)
+    exact = drain(interreflect(ball_gather.matrix, colour, np.ascontiguousarray(direct.T), 1e-7)).transfer[:, :, 0]
+    for at_once in (5, 24):
+        found, report = drain(bounced_columns(ball_gather.matrix, colour, direct, 1e-3, at_once=at_once))
+        assert report.residual <= 1e-3 and np.linalg.norm(found.T - exact) < 2e-3 * np.linalg.norm(exact)
+
+
 def test_white_surfaces_under_a_white_sky_are_white(ball, ball_gather):
     # Any open scene that reflects everything looks like its furnace: exactly 1 wherever light can reach.
     _, tracer, _ = ball
