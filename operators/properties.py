@@ -48,6 +48,14 @@ ENCODER_ITEMS = (
     ("iterative", "Iterative", "Clusters follow as vectors are added. Costs some seconds more than static", 1),
     ("adaptive", "Adaptive", "Clusters that need more vectors get them. The least error for the same data, at up to "
                              "twice the time", 2),
+    ("eigentransport", "Eigentransport", "One basis for all receivers, with more vectors. Relights fast; needs about a "
+                                         "hundred vectors, and blurs or rings in hard shadows", 3),
+)
+DISTANT_BASIS_ITEMS = (
+    ("sh", "Spherical Harmonics", "Smooth functions: small, fast, with highlights and translucency. A sun's shadows "
+                                  "are as soft as the order says", 0),
+    ("cubemap", "Cubemap", "The texels of a cubemap: shadows of suns as sharp as a texel. Costs several times the time "
+                           "and memory; diffuse light only, metal is black", 1),
 )
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
@@ -59,6 +67,7 @@ QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing"
            "surface_columns", "cloud_lights", "merge_response")
 # What goes into a bake under its own name.
 OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "lamp_basis", "cloud_spacing", "cloud_emission",
+             "distant_basis", "cubemap_size", "memory_budget",
              "zone_receivers", "fit_order_to_light", "threads", "seed")
 ROUNDING = 1e-6  # of single precision
 
@@ -108,6 +117,20 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Order", min=1, max=HIGHEST_ORDER, default=PRESETS["standard"].order,
         description="Bands of the lighting. Higher buys sharper shadows; memory and relighting cost grow with the "
                     "square",
+    )
+    distant_basis: EnumProperty(
+        name="Sky By", items=DISTANT_BASIS_ITEMS, default=PRESETS["standard"].distant_basis,
+        description="What World and Suns are baked in",
+    )
+    cubemap_size: IntProperty(
+        name="Texels", min=2, max=32, default=PRESETS["standard"].cubemap_size,
+        description="Along each edge of the cubemap. Twice as many show shadows twice as sharp; time, memory and disk "
+                    "grow with the square",
+    )
+    memory_budget: FloatProperty(
+        name="Memory", min=0.0, soft_max=64.0, precision=1, default=PRESETS["standard"].memory_budget,
+        description="Gigabytes of transfer kept in memory while a cubemap is baked; more goes to a file, which costs "
+                    "time. 0 is no limit",
     )
     bounces: BoolProperty(
         name="Bounced Light", default=True,
@@ -172,8 +195,9 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "of light costs a little more",
     )
     vectors: IntProperty(
-        name="Most Vectors", min=0, max=24, default=PRESETS["standard"].vectors,
-        description="Basis vectors of each cluster. More buys less error; every receiver stores one number for each",
+        name="Most Vectors", min=0, max=192, soft_max=24, default=PRESETS["standard"].vectors,
+        description="Basis vectors of each cluster. More buys less error; every receiver stores one number for each. "
+                    "Up to 24, with Eigentransport up to 192",
     )
     compression_error: FloatProperty(
         name="Error Goal", min=0.0, max=1.0, precision=4, step=0.1, default=PRESETS["standard"].compression_error,
