@@ -19,6 +19,7 @@ import numpy as np
 
 from ..prt_addon.baking.process import raise_error
 from ..prt_addon.baking.settings import BakeSettings, make_settings
+from ..prt_addon.blender.image_albedo import surface_textures
 from ..prt_addon.blender.lights import environment_picture
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.errors import BadArguments, StorageError
@@ -96,8 +97,9 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
     percentage = scene.render.resolution_percentage / 100.0
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
                                        max(1, round(scene.render.resolution_y * percentage)))
-    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name])  # small: what moved is refused
-             for name, b in baked.items()]
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name],  # small: what moved is refused
+                      textures=surface_textures(scene.objects[name], b, depsgraph)) for name, b in baked.items()]
     background = None
     if not scene.render.film_transparent:
         sky, rotation = environment_picture(scene, bpy.context.evaluated_depsgraph_get(), arguments.environment,
