@@ -12,10 +12,12 @@ from .operators.clear import PRT_OT_clear
 from .operators.job_mixin import JobMixin
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
-from .panels.bake import PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights
+from .panels.bake import PRT_PT_bake
 from .panels.lamp import PRT_PT_lamp
 from .panels.preview import PRT_PT_preview
+from .panels.properties_editor import PRT_PT_object, PRT_PT_world
 from .panels.results import PRT_PT_results
+from .panels.settings import PRT_PT_compression, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_rays
 
 CLASSES = (
     properties.PRTSettings,
@@ -28,11 +30,15 @@ CLASSES = (
     PRT_OT_toggle_preview,
     PRT_OT_relight,
     PRT_PT_bake,
+    PRT_PT_rays,
     PRT_PT_highlights,
     PRT_PT_local_lights,
+    PRT_PT_compression,
     PRT_PT_preview,
     PRT_PT_results,
     PRT_PT_lamp,
+    PRT_PT_object,
+    PRT_PT_world,
 )
 
 

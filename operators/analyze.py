@@ -7,7 +7,7 @@ import bpy
 
 from ..prt_addon.baking.settings import make_settings
 from ..prt_addon.errors import PRTError
-from .bake_session import analysis_lines, analyze_scene
+from .bake_session import analysis_lines, analyze_scene, chosen_targets
 from .properties import assign, session
 
 
@@ -27,7 +27,7 @@ class PRT_OT_analyze(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
-            analysis = analyze_scene(context.evaluated_depsgraph_get(), settings, None)
+            analysis = analyze_scene(context.evaluated_depsgraph_get(), settings, chosen_targets(context.scene))
         except PRTError as error:
             assign(session(context), analysis="", message=str(error), failed=True)
             self.report({"ERROR"}, str(error))

@@ -7,13 +7,13 @@ import bpy
 
 from ..prt_addon.baking.settings import make_settings, parse_overrides
 from . import live_preview
-from .bake_session import BakeSession, baked_message
+from .bake_session import BakeSession, baked_message, chosen_targets
 from .job_mixin import JobMixin
 
 
 class PRT_OT_bake(JobMixin, bpy.types.Operator):
-    """Bake how the selected meshes (all visible ones when none is selected) respond to light.
-    Blender stays usable meanwhile; the previous bake is replaced only by a complete new one"""
+    """Bake how the selected meshes (all visible ones when none is selected), or those of a collection, respond to
+    light. Blender stays usable meanwhile; the previous bake is replaced only by a complete new one"""
 
     bl_idname = "prt.bake"
     bl_label = "Bake Light Transfer"
@@ -41,7 +41,7 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
     def start_job(self, context: bpy.types.Context) -> BakeSession:
         settings = make_settings(context.scene.prt.preset,
                                  context.scene.prt.overrides() | parse_overrides(self.overrides))
-        return BakeSession.start(context.evaluated_depsgraph_get(), settings, None)
+        return BakeSession.start(context.evaluated_depsgraph_get(), settings, chosen_targets(context.scene))
 
     def finish_job(self, context: bpy.types.Context, job: BakeSession) -> str:
         result = job.store()

@@ -31,7 +31,7 @@ from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import write_baked
-from ..prt_addon.blender.visibility import find_objects
+from ..prt_addon.blender.visibility import find_objects, render_visible_objects
 from ..prt_addon.errors import BadScene, StorageError
 from ..prt_addon.lighting.light_cloud import free_space
 from ..prt_addon.reporting.headline import PARTS, headline
@@ -50,6 +50,22 @@ def jobs_folder() -> Path:
     if ROOT_PACKAGE.startswith("bl_ext."):
         return Path(bpy.utils.extension_path_user(ROOT_PACKAGE, path="jobs"))
     return Path(bpy.utils.user_resource("DATAFILES", path="prt/jobs"))
+
+
+def chosen_targets(scene: bpy.types.Scene) -> list[str] | None:
+    """Names of the objects that the panel's settings choose, as `read_scene` takes them; None leaves it to the
+    selection. Raises BadScene where a collection is asked for and gives none."""
+    settings = scene.prt
+    if settings.targets == "selected":
+        return None
+    collection = settings.target_collection
+    if collection is None:
+        raise BadScene("Bake", "no collection is chosen", "Choose one, or bake selected objects")
+    visible = {name for layer in scene.view_layers for name in render_visible_objects(layer)}
+    names = [o.name_full for o in collection.all_objects if o.type == "MESH" and o.name_full in visible]
+    if not names:
+        raise BadScene(collection.name, "no mesh in it is shown in renders", "Choose another collection, or enable one")
+    return names
 
 
 def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> SceneMesh:

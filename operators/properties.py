@@ -43,17 +43,28 @@ GLOSSY_ROWS_ITEMS = (
     ("24", "24 Functions", "Sharper highlights. Costs as much as 24 diffuse bakes of the shiny objects", 4),
     ("25", "25 Functions", "One function more than 24, for next to nothing gained: to compare with published data", 5),
 )
+ENCODER_ITEMS = (
+    ("static", "Static", "Clusters first, vectors afterwards. The fastest, with a third more error than iterative", 0),
+    ("iterative", "Iterative", "Clusters follow as vectors are added. Costs some seconds more than static", 1),
+    ("adaptive", "Adaptive", "Clusters that need more vectors get them. The least error for the same data, at up to "
+                             "twice the time", 2),
+)
+TARGET_ITEMS = (
+    ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
+    ("collection", "Collection", "The meshes of a collection, whatever is selected", 1),
+)
 # What presets differ in, and so fill in; the rest belongs to the scene rather than to the quality, and stays.
-QUALITY = ("order", "glossy_rows", "glossy_albedo", "surface_columns", "cloud_lights",
-           "merge_response")
-# What goes into a bake under its own name, words apart from numbers.
-OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "cloud_spacing", "zone_receivers")
-# Blender keeps floats in single precision.
-ROUNDING = 1e-6
+QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing", "encoder", "clusters", "vectors",
+           "compression_error", "error_receivers", "error_paths", "glossy_rows", "glossy_albedo", "surface_patches",
+           "surface_columns", "cloud_lights", "merge_response")
+# What goes into a bake under its own name.
+OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "lamp_basis", "cloud_spacing", "cloud_emission",
+             "zone_receivers", "fit_order_to_light", "threads", "seed")
+ROUNDING = 1e-6  # of single precision
 
 
 def _take_preset(settings: PRTSettings, _context: bpy.types.Context) -> None:
-    """Choosing a preset fills in the numbers that presets differ in."""
+    """Choosing a preset fills in what presets differ in."""
     preset = PRESETS[settings.preset]
     for name in QUALITY:
         value = getattr(preset, name)
@@ -80,6 +91,15 @@ def _light_changed(_settings: PRTSettings, _context: bpy.types.Context) -> None:
 class PRTSettings(bpy.types.PropertyGroup):
     """Settings of the bake and of the preview: Scene.prt."""
 
+    targets: EnumProperty(
+        name="Bake", items=TARGET_ITEMS, default="selected",
+        description="Which meshes get light transfer, and so can be relit. Each costs time and data by its vertices; "
+                    "everything else that renders show casts shadows and bounces light all the same",
+    )
+    target_collection: PointerProperty(
+        name="Collection", type=bpy.types.Collection,
+        description="Its meshes, and those of collections in it, are baked. What renders do not show is left out",
+    )
     preset: EnumProperty(
         name="Preset", items=PRESET_ITEMS, default="standard", update=_take_preset,
         description="How much time a bake may cost and how exact it gets",
@@ -103,6 +123,72 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Soften Ringing", update=_light_changed, default=False,
         description="Takes dark ripples around very bright, small lights away. Costs some of the light's detail, and "
                     "nothing where nothing rings",
+    )
+
+    directions: IntProperty(
+        name="Shadow Rays", min=16, max=2 ** 20, soft_max=16384, default=PRESETS["standard"].directions,
+        description="Rays around each receiver that find what shadows it. Twice as many take twice as long and halve "
+                    "the noise of sharp shadows",
+    )
+    gather_directions: IntProperty(
+        name="Bounce Rays", min=16, max=2 ** 16, soft_max=4096, default=PRESETS["standard"].gather_directions,
+        description="Rays around each receiver that find the surfaces which light it. More buys smoother bounced light "
+                    "in corners, at the cost of time and memory in proportion",
+    )
+    bounce_error: FloatProperty(
+        name="Bounces Until", min=1e-7, max=1.0, precision=5, step=0.01, default=PRESETS["standard"].bounce_error,
+        description="Share of the light that further bounces may leave out. Lower follows more bounces in bright, "
+                    "closed rooms, and costs a fraction of a second for each",
+    )
+    spacing: FloatProperty(
+        name="Longest Edge", min=0.0, max=1.0, precision=4, step=0.1, default=PRESETS["standard"].spacing,
+        description="Longest triangle edge as a share of the scene's size; larger triangles get receivers in "
+                    "between, on a hidden mesh. Half as long shows sharper shadows on large faces for up to four "
+                    "times the cost. 0 leaves meshes as they are",
+    )
+    fit_order_to_light: BoolProperty(
+        name="Fit Order to Light", default=PRESETS["standard"].fit_order_to_light,
+        description="Lower the order to what the light of this moment needs. Saves time and data under soft skies; "
+                    "sharper light that comes later is shown blurred",
+    )
+    threads: IntProperty(
+        name="Threads", min=0, max=1024, soft_max=64, default=PRESETS["standard"].threads,
+        description="Processor threads of the bake. Fewer leave more of the machine to other work; results stay the "
+                    "same. 0 uses every core",
+    )
+    seed: IntProperty(
+        name="Seed", min=0, default=PRESETS["standard"].seed,
+        description="Of all random choices. The same seed bakes the same data; another one shows what is noise. Costs "
+                    "nothing",
+    )
+
+    encoder: EnumProperty(
+        name="Encoder", items=ENCODER_ITEMS, default=PRESETS["standard"].encoder,
+        description="How clusters and their vectors are found",
+    )
+    clusters: IntProperty(
+        name="Most Clusters", min=1, max=4096, default=PRESETS["standard"].clusters,
+        description="Groups of receivers that share basis vectors. More buys less error; data grows, and each change "
+                    "of light costs a little more",
+    )
+    vectors: IntProperty(
+        name="Most Vectors", min=0, max=24, default=PRESETS["standard"].vectors,
+        description="Basis vectors of each cluster. More buys less error; every receiver stores one number for each",
+    )
+    compression_error: FloatProperty(
+        name="Error Goal", min=0.0, max=1.0, precision=4, step=0.1, default=PRESETS["standard"].compression_error,
+        description="Relative error at which compression stops adding clusters and vectors. Higher buys less data. 0 "
+                    "uses all of them",
+    )
+    error_receivers: IntProperty(
+        name="Receivers", min=0, max=4096, default=PRESETS["standard"].error_receivers,
+        description="Random receivers at which the finished bake is measured against independent path tracing. More "
+                    "buys a surer figure for some seconds; 0 measures nothing",
+    )
+    error_paths: IntProperty(
+        name="Paths", min=64, max=2 ** 20, default=PRESETS["standard"].error_paths,
+        description="Paths from each of those receivers. More buys a measurement with less noise of its own, and "
+                    "costs time in proportion",
     )
 
     lighting: EnumProperty(
@@ -140,6 +226,11 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Lamps By", items=LAMP_BASIS_ITEMS, default=PRESETS["standard"].lamp_basis,
         description="What stands for lamps in the bake",
     )
+    surface_patches: IntProperty(
+        name="Patches", min=1, max=2 ** 14, default=PRESETS["standard"].surface_patches,
+        description="Most patches that lit surfaces are divided into. More follow small spots and lamps near to "
+                    "surfaces; each costs one more solution of the bounced light",
+    )
     surface_columns: IntProperty(
         name="Columns", min=1, max=1024, default=PRESETS["standard"].surface_columns,
         description="Ways in which the light of lamps can differ after a bounce. More follow lamps near to surfaces "
@@ -165,6 +256,11 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Distance between the lights of the cloud, in place of their number. Smaller follows a moving lamp "
                     "more closely; half of it costs eight times as much. 0 is as Lights allow",
     )
+    cloud_emission: IntProperty(
+        name="Emission Order", min=0, max=4, default=PRESETS["standard"].cloud_emission,
+        description="How sharply lights of the cloud can shine in one direction, for Spot and Area lamps. Columns and "
+                    "data grow with its square. 0 chooses by the scene's lamps",
+    )
     merge_response: FloatProperty(
         name="Merge Below", min=0.0, soft_max=1.0, precision=3, default=PRESETS["standard"].merge_response,
         description="Lights merge whose light differs less than this share of the brightest. Higher buys less data and "
@@ -179,10 +275,9 @@ class PRTSettings(bpy.types.PropertyGroup):
     def overrides(self) -> dict[str, str]:
         """What these settings change in their preset, by name, as `make_settings` takes it."""
         preset = PRESETS[self.preset]
+        # Files of older versions lack newer settings: what was never set is the preset's, not the default.
         changed = {name: _text(getattr(self, name)) for name in OWN_NAMES
-                   if abs(float(getattr(self, name)) - float(getattr(preset, name))) > ROUNDING}
-        if self.lamp_basis != preset.lamp_basis:
-            changed["lamp_basis"] = self.lamp_basis
+                   if self.is_property_set(name) and _differ(getattr(self, name), getattr(preset, name))}
         if not self.bounces:
             changed["bounces"] = "0"
         if LIGHTINGS[self.lighting] != preset.lighting:
@@ -191,6 +286,13 @@ class PRTSettings(bpy.types.PropertyGroup):
         if region is not None:
             changed["cloud_region"] = region.name
         return changed
+
+
+def _differ(value: float | str, other: float | str) -> bool:
+    """Whether a setting is another one than a preset's; Blender keeps floats in single precision."""
+    if isinstance(other, str):
+        return value != other
+    return abs(float(value) - float(other)) > ROUNDING * abs(float(other)) + 1e-12
 
 
 def _text(value: float | str) -> str:

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import bpy
 
-from .layout import Sidebar, wrapped
+from .layout import Sidebar, plural, wrapped
+
+NAMES = 3  # of objects that are told
+TOLD_AS = {"Left out:": "REMOVE", "Bake:": "ERROR"}  # icons of an analysis' lines by how they start
 
 
 class PRT_PT_bake(Sidebar, bpy.types.Panel):
@@ -20,13 +21,22 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
         layout, settings, session = self.layout, context.scene.prt, context.window_manager.prt
         layout.use_property_split = True
         layout.use_property_decorate = False
-        layout.label(text=_targets(context), icon="MESH_DATA")
+        column = layout.column()
+        column.enabled = not session.running
+        column.prop(settings, "targets")
+        if settings.targets == "collection":
+            column.prop(settings, "target_collection")
+        told = layout.column(align=True)
+        for line, icon in _what_is_baked(context):
+            wrapped(told, context, line, icon)
         column = layout.column()
         column.enabled = not session.running
         column.prop(settings, "preset")
         column.prop(settings, "lighting")
+        for line in _light_warnings(context):
+            wrapped(column, context, line, "ERROR")
         distant = column.column()
-        distant.active = settings.lighting != "local"  # lamps of a cloud know no order
+        distant.active = settings.lighting != "local"  # columns of lamps know no order
         distant.prop(settings, "order")
         column.prop(settings, "bounces")
         if session.running:
@@ -41,76 +51,42 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
             wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
         if session.analysis:
             box = layout.box()
-            for line in session.analysis.splitlines():
-                wrapped(box, context, line)
+            for number, line in enumerate(session.analysis.splitlines()):
+                icon = next((i for start, i in TOLD_AS.items() if line.startswith(start)), "INFO")
+                wrapped(box, context, line[0].upper() + line[1:], "TIME" if number == 0 else icon)
 
 
-class _Expert(Sidebar):
-    """A folded part of the bake's panel: what a preset has filled in, to be changed."""
-
-    bl_parent_id = "PRT_PT_bake"
-    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
-
-    def column(self, context: bpy.types.Context) -> bpy.types.UILayout:
-        """A column for settings, greyed while a bake runs."""
-        self.layout.use_property_split = True
-        self.layout.use_property_decorate = False
-        column = self.layout.column()
-        column.enabled = not context.window_manager.prt.running
-        return column
-
-
-class PRT_PT_highlights(_Expert, bpy.types.Panel):
-    """What shiny and translucent materials get."""
-
-    bl_idname = "PRT_PT_highlights"
-    bl_label = "Highlights"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        settings, column = context.scene.prt, self.column(context)
-        column.prop(settings, "glossy_rows")
-        shiny = column.column()
-        shiny.active = settings.glossy_rows != "0"
-        shiny.prop(settings, "glossy_albedo")
-        shiny.prop(settings, "glossy_window")
-        column.prop(settings, "subsurface")
-        coherent = column.column()
-        coherent.active = settings.lighting == "environment"  # it would move receivers out of their zones
-        coherent.prop(settings, "coherence")
+def _what_is_baked(context: bpy.types.Context) -> list[tuple[str, str]]:
+    """What gets transfer, and what only casts shadows and bounces light: lines and their icons."""
+    settings = context.scene.prt
+    shown = [o for o in context.scene.objects if o.type == "MESH" and not o.hide_render]
+    if settings.targets == "collection":
+        if settings.target_collection is None:
+            return [("Choose a collection", "ERROR")]
+        chosen = [o for o in settings.target_collection.all_objects if o.type == "MESH" and not o.hide_render]
+        if not chosen:
+            return [(f"No mesh of {settings.target_collection.name} is shown in renders", "ERROR")]
+    else:
+        chosen = [o for o in context.selected_objects if o.type == "MESH"] or shown
+    if not chosen:
+        return [("No mesh is shown in renders", "ERROR")]
+    names = ", ".join(o.name for o in chosen[:NAMES]) + (f" and {len(chosen) - NAMES} more" * (len(chosen) > NAMES))
+    others = len(shown) - len(chosen)
+    if others <= 0:
+        return [(names, "MESH_DATA")]
+    return [(names, "MESH_DATA"), (f"{plural(others, 'more mesh', 'more meshes')} cast shadows and bounce light",
+                                   "LIGHT_SUN")]
 
 
-class PRT_PT_local_lights(_Expert, bpy.types.Panel):
-    """The cloud of lights that stands for lamps that move."""
-
-    bl_idname = "PRT_PT_local_lights"
-    bl_label = "Local Lights"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return context.scene.prt.lighting != "environment"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        settings, column = context.scene.prt, self.column(context)
-        column.prop(settings, "lamp_basis")
-        by_cloud = settings.lamp_basis == "cloud"
-        if not by_cloud:
-            column.prop(settings, "surface_columns")
-        column.prop(settings, "cloud_region")
-        several = column.column()
-        several.active = settings.cloud_region is None
-        several.prop(settings, "cloud_collection")
-        lights = column.column()
-        lights.active = settings.cloud_spacing == 0.0
-        lights.prop(settings, "cloud_lights")
-        column.prop(settings, "cloud_spacing")
-        if by_cloud:
-            column.prop(settings, "merge_response")
-            column.prop(settings, "zone_receivers")
-
-
-def _targets(context: bpy.types.Context) -> str:
-    count = sum(o.type == "MESH" for o in context.selected_objects)
-    return "All visible meshes" if count == 0 else f"{count} selected mesh{'' if count == 1 else 'es'}"
+def _light_warnings(context: bpy.types.Context) -> list[str]:
+    """What is missing for the chosen kind of lighting."""
+    settings = context.scene.prt
+    if settings.lighting == "environment":
+        return []
+    lamps = any(o.type == "LIGHT" and o.data.type != "SUN" and not o.hide_render for o in context.scene.objects)
+    if lamps or settings.cloud_region is not None or settings.cloud_collection is not None:
+        return []
+    return ["No lamp is in the scene: add one, or choose the region where lamps will move"]
 
 
 def _progress(session: bpy.types.PropertyGroup) -> str:

@@ -8,6 +8,7 @@ import textwrap
 import bpy
 
 CHARACTERS_PER_WIDTH = 0.15  # of the interface font at scale 1, per pixel of region width
+THIN_SPACE = "\u202f"  # between thousands, as in the report
 MARGIN = 60  # pixels of a region that hold no text: icon, borders
 
 
@@ -19,9 +20,9 @@ class Sidebar:
     bl_category = "PRT"
 
 
-def plural(count: int, what: str) -> str:
-    """"1 face", "1,200 faces"."""
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
+def plural(count: int, what: str, several: str = "") -> str:
+    """"1 face", "1 200 faces"; several: where more of it are called otherwise than with an s."""
+    return f"{count:,} ".replace(",", THIN_SPACE) + (what if count == 1 else several or f"{what}s")
 
 
 def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE",

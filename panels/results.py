@@ -27,16 +27,21 @@ class PRT_PT_results(Sidebar, bpy.types.Panel):
                 box.label(text=line, icon="BLANK1" if number else "LIGHT")
         column = layout.box().column(align=True)
         for line in session.objects[:ROWS]:
-            row = column.row()
-            row.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
-            row.label(text=plural(line.points, "receiver") if line.points else "not readable")
-            for details in _details(line):
-                column.label(text=details, icon="BLANK1")
-            if line.stale:
-                wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
+            draw_object(column, context, line)
         if len(session.objects) > ROWS:
             column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
         layout.operator("prt.clear", icon="TRASH")
+
+
+def draw_object(column: bpy.types.UILayout, context: bpy.types.Context, line: bpy.types.PropertyGroup) -> None:
+    """One baked object in a few rows: how much data, how exact, and whether it still holds."""
+    row = column.row()
+    row.label(text=line.name, icon="ERROR" if line.stale else "CHECKMARK")
+    row.label(text=plural(line.points, "receiver") if line.points else "not readable")
+    for details in _details(line):
+        column.label(text=details, icon="BLANK1")
+    if line.stale:
+        wrapped(column, context, line.stale[0].upper() + line.stale[1:], "BLANK1", alert=True)
 
 
 def _details(line: bpy.types.PropertyGroup) -> list[str]:

@@ -19,7 +19,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
     sys.modules["prt"].__path__ = [str(ROOT)]
 
 # Of the preview alone, or turned into a field of another name.
-NO_FIELDS = {"preset", "exposure", "window", "cloud_collection"}
+NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection"}
 
 
 @pytest.fixture
@@ -59,7 +59,14 @@ def test_a_chosen_preset_changes_nothing_of_itself(settings: bpy.types.PropertyG
     ("glossy_window", False, "glossy_window", False), ("subsurface", False, "subsurface", False),
     ("coherence", 0.05, "coherence", 0.05), ("cloud_lights", 4096, "cloud_lights", 4096),
     ("cloud_spacing", 0.25, "cloud_spacing", 0.25), ("merge_response", 0.0, "merge_response", 0.0),
-    ("zone_receivers", 100_000, "zone_receivers", 100_000)])
+    ("zone_receivers", 100_000, "zone_receivers", 100_000), ("directions", 512, "directions", 512),
+    ("gather_directions", 64, "gather_directions", 64), ("bounce_error", 3e-6, "bounce_error", 3e-6),
+    ("spacing", 0.3, "spacing", 0.3), ("fit_order_to_light", True, "fit_order_to_light", True),
+    ("threads", 3, "threads", 3), ("seed", 12345, "seed", 12345), ("clusters", 33, "clusters", 33),
+    ("vectors", 11, "vectors", 11), ("compression_error", 0.25, "compression_error", 0.25),
+    ("error_receivers", 7, "error_receivers", 7), ("error_paths", 100, "error_paths", 100),
+    ("surface_patches", 77, "surface_patches", 77), ("cloud_emission", 3, "cloud_emission", 3),
+    ("lamp_basis", "cloud", "lamp_basis", "cloud")])
 @pytest.mark.parametrize("preset", ["draft", "standard", "high"])
 def test_each_control_changes_its_setting_and_no_other(preset: str, name: str, value: object, field: str,
                                                        expected: object, settings: bpy.types.PropertyGroup) -> None:
@@ -136,23 +143,49 @@ class Drawn:
 
 @pytest.mark.parametrize(("lighting", "basis"), [("environment", None), ("local", "cloud"), ("both", "surfaces")])
 def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: bpy.types.PropertyGroup) -> None:
-    from prt.panels.bake import PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights
-    from prt.panels.preview import PRT_PT_preview
+    from prt.panels import bake, preview
+    from prt.panels import settings as expert
 
-    settings.lighting = lighting
+    settings.lighting, settings.targets = lighting, "collection"
     if basis is not None:
         settings.lamp_basis = basis
     found: set[str] = set()
     context = types.SimpleNamespace(scene=bpy.context.scene, window_manager=bpy.context.window_manager,
-                                    selected_objects=[], preferences=bpy.context.preferences,
-                                    region=types.SimpleNamespace(width=300))
-    for panel in (PRT_PT_bake, PRT_PT_highlights, PRT_PT_local_lights, PRT_PT_preview):
+                                    selected_objects=[], region=types.SimpleNamespace(width=300),
+                                    preferences=types.SimpleNamespace(system=types.SimpleNamespace(ui_scale=1.0)))
+    for panel in (bake.PRT_PT_bake, expert.PRT_PT_rays, expert.PRT_PT_highlights, expert.PRT_PT_local_lights,
+                  expert.PRT_PT_compression, preview.PRT_PT_preview):
         if "poll" not in vars(panel) or panel.poll(context):
             drawing = types.SimpleNamespace(layout=Drawn(found))
             drawing.column = lambda context, panel=panel, drawing=drawing: panel.column(drawing, context)
             panel.draw(drawing, context)
     lamps = {"lamp_basis", "cloud_region", "cloud_collection", "cloud_lights", "cloud_spacing"}
-    own = {"cloud": {"merge_response", "zone_receivers"}, "surfaces": {"surface_columns"}}
+    own = {"cloud": {"merge_response", "zone_receivers", "cloud_emission"},
+           "surfaces": {"surface_patches", "surface_columns"}}
     every = lamps | own["cloud"] | own["surfaces"]
     assert found & every == (set() if basis is None else lamps | own[basis])
     assert set(names(settings)) - every <= found
+
+
+def test_a_collection_is_baked_whatever_is_selected(settings: bpy.types.PropertyGroup) -> None:
+    """With those of collections in it; what renders do not show is left out, and an empty one says so."""
+    from prt.operators.bake_session import chosen_targets
+    from prt.prt_addon.errors import BadScene
+
+    assert chosen_targets(bpy.context.scene) is None
+    settings.targets = "collection"
+    with pytest.raises(BadScene, match="no collection is chosen"):
+        chosen_targets(bpy.context.scene)
+    outer, inner = (bpy.data.collections.new(name) for name in ("Outer", "Inner"))
+    bpy.context.scene.collection.children.link(outer)
+    outer.children.link(inner)
+    settings.target_collection = outer
+    with pytest.raises(BadScene, match="Outer"):
+        chosen_targets(bpy.context.scene)
+    for collection, name in ((outer, "A"), (inner, "B"), (inner, "Hidden"), (bpy.context.scene.collection, "Other")):
+        bpy.ops.mesh.primitive_cube_add()
+        cube = bpy.context.object
+        cube.name, cube.hide_render = name, name == "Hidden"
+        bpy.context.collection.objects.unlink(cube)
+        collection.objects.link(cube)
+    assert sorted(chosen_targets(bpy.context.scene)) == ["A", "B"]

@@ -30,6 +30,7 @@ UI_SECONDS = 600
 SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
+    "untouched": ("untouched_in_blender.py", "make_scene.py"),
 }
 COMMAND_SECONDS = 240
 
