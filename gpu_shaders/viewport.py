@@ -17,7 +17,7 @@ Handlers do not run in final renders nor in viewport renders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,6 +74,7 @@ class _Viewport:
     handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
     framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
+    drawn: dict[int, set[Hashable]] = field(default_factory=dict)  # keys of the last redraw by region
     status: ViewportStatus = field(default_factory=lambda: ViewportStatus(enabled=True))
 
 
@@ -148,11 +149,21 @@ def _draw_region() -> None:
         return
     try:
         items = viewport.get_draw_list()
-        viewport.cache.keep_only({item.key for item in items})
+        viewport.cache.keep_only(_keys_in_use(viewport, region, items))
         _draw_items(viewport, items, framebuffer)
         viewport.status.objects, viewport.status.error = len(items), ""
     except PRTError as error:  # nobody can catch it here; the panel shows it
         viewport.status.objects, viewport.status.error = 0, str(error)
+
+
+def _keys_in_use(viewport: _Viewport, region: bpy.types.Region, items: Sequence[DrawItem]) -> set[Hashable]:
+    """What this and the other open regions draw: one in local view, or of another scene, must not cost them theirs."""
+    windows = bpy.context.window_manager.windows if bpy.context.window_manager else ()
+    there = {other.as_pointer() for window in windows for area in window.screen.areas if area.type == "VIEW_3D"
+             for other in area.regions}
+    viewport.drawn = {pointer: keys for pointer, keys in viewport.drawn.items() if pointer in there}
+    viewport.drawn[region.as_pointer()] = {item.key for item in items}
+    return set().union(*viewport.drawn.values())
 
 
 def _draw_labels() -> None:

@@ -2,7 +2,8 @@
 """What the viewport draws, and the handlers that make it follow the scene and its light.
 
 Handlers only note that something changed; a timer does the work soon after, so that dragging a Sun stays smooth: it
-waits at least as long as the last evaluation of the light took. Objects are kept by name: undo invalidates references.
+waits at least as long as the last evaluation of the light took. Objects are kept by name: undo invalidates references,
+and a renamed one is found anew.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import bpy
 import numpy as np
@@ -18,12 +20,12 @@ from numpy.typing import NDArray
 
 from ..gpu_shaders import viewport
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
-from ..prt_addon.basis.spherical_harmonics import rotate
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
-from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
+from ..prt_addon.blender.stored import baked_mesh, baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
 from ..prt_addon.lighting.local_lights import LocalLight
+from ..prt_addon.relighting.moved_light import distant_light_in, is_turned
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
@@ -34,26 +36,53 @@ STALE_WAIT = 0.3  # the digest of a mesh costs more than a light and nobody watc
 STILL_SECONDS = 0.25  # after its last move a lamp counts as let go, and its soft shadows are refined
 NOTE_WAIT = 1.0  # after a redraw was asked for, its outcome is known
 OUTSIDE_LABEL = "outside the light cloud: no bounced light"
+OUTLINES = ("BOUNDS", "WIRE")
 SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
+SURFACE_DATA = (bpy.types.Material, bpy.types.Mesh)
+LISTED_TYPES = (bpy.types.Object, bpy.types.Scene, bpy.types.Collection)
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
 
 
 @dataclass
 class Shown:
-    """One baked object as it was read; the rest of its DrawItem is looked up on every redraw."""
+    """One baked object as it was read; the rest of its DrawItem is looked up on every redraw.
+
+    moved: (4, 4) since its bake, while all that is around it came along; None where the bake is stale.
+    """
 
     baked: BakedTransfer
     key: Hashable
     stale: bool = False
     direct: NDArray[np.float32] | None = None
+    moved: NDArray[np.float64] | None = None
+
+
+@dataclass
+class Line:
+    """What the panel lists of one object: the values of a `PRTBakedObject`."""
+
+    name: str
+    clusters: int = 0
+    points: int = 0
+    error: float = -1.0
+    highlight_error: float = -1.0
+    lamp_error: float = -1.0
+    lamp_highlight_error: float = -1.0
+    overdraw: float = 0.0
+    overdraw_before: float = 0.0
+    error_spent: float = 0.0
+    stale: str = ""
 
 
 @dataclass
 class Live:
-    """Everything that the handlers share."""
+    """Everything that the handlers share about one scene as one view layer shows it. shown, lines: by `name_full`."""
 
     shown: dict[str, Shown] = field(default_factory=dict)
+    lines: list[Line] = field(default_factory=list)
+    known: Hashable = None
+    message: str = ""
     light: NDArray[np.float64] | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
@@ -65,24 +94,46 @@ class Live:
     rotated: dict[Hashable, NDArray[np.float64]] = field(default_factory=dict)
     light_seconds: float = 0.0
     stale_seconds: float = 0.0
+    stale_due: float = 0.0
     bakes_dirty: bool = True
     light_dirty: bool = True
     stale_dirty: bool = True
-    working: bool = False
+    working: ClassVar[bool] = False
+    due: ClassVar[float] = 0.0  # of the timer
 
 
-_live = Live()
+_lives: dict[Hashable, Live] = {}  # of what windows show
+
+
+def _context_key() -> Hashable:
+    return bpy.context.scene.session_uid, bpy.context.view_layer.name
+
+
+class _OfContext:
+    """The `Live` of the context's scene and view layer: two windows may show two scenes."""
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(_lives.setdefault(_context_key(), Live()), name)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        setattr(_lives.setdefault(_context_key(), Live()), name, value)
+
+
+_live = _OfContext()
 
 
 def bakes_changed() -> None:
     """Baked data was written or removed: read it again soon."""
-    _live.bakes_dirty = _live.light_dirty = _live.stale_dirty = True
+    for live in _lives.values():
+        live.bakes_dirty = live.light_dirty = live.stale_dirty = True
+        live.stale_due = 0.0
     _schedule(SHORTEST_WAIT)
 
 
 def light_changed() -> None:
     """A setting of the light was changed: evaluate it again soon."""
-    _live.light_dirty = True
+    for live in _lives.values():
+        live.light_dirty = True
     _schedule(SHORTEST_WAIT)
 
 
@@ -91,7 +142,8 @@ def enable() -> None:
     _read_bakes()
     _read_light()
     viewport.enable(draw_list, shows_everything, labels)
-    assign(session(), preview=True, preview_message="")
+    assign(session(), preview=True)
+    _tell_panel()
 
 
 def disable() -> None:
@@ -102,33 +154,49 @@ def disable() -> None:
 
 def settled() -> bool:
     """Whether nothing is left to be done: what was noted is evaluated, no light fades, no soft shadow is coarse."""
-    dirty = _live.bakes_dirty or _live.stale_dirty or (session().preview and _live.light_dirty)
-    return not dirty and not _live.moving
+    preview = session().preview
+    return not any(live.bakes_dirty or live.stale_dirty or live.moving or (preview and live.light_dirty)
+                   for live in _lives.values())
 
 
 def draw_list() -> list[DrawItem]:
     """What one region draws now: called on every redraw, so it only looks things up."""
+    if _live.bakes_dirty or _live.light_dirty:  # a scene that no window showed until now
+        _schedule(SHORTEST_WAIT)
     if _live.signature is None:
         return []
     space, exposure = bpy.context.space_data, 2.0 ** bpy.context.scene.prt.exposure
-    items = []
-    for name, shown in _live.shown.items():
-        found = bpy.data.objects.get(name)
-        if found is None or found.mode != "OBJECT" or not found.visible_in_viewport_get(space):
+    items, present = [], 0
+    for found in bpy.context.view_layer.objects:
+        shown = _live.shown.get(found.name_full)
+        present += shown is not None
+        if shown is None or not _is_drawn(found, space):
             continue
         moved = transform_since_bake(found, shown.baked.header)
-        light = joined_light(shown.baked.lighting_basis, _light_in(moved), _live.lamps.cloud_light(shown.baked))
+        light = joined_light(shown.baked.lighting_basis, _light_in(moved),
+                             _live.lamps.cloud_light(shown.baked, shown.moved))
         items.append(DrawItem(shown.key, shown.baked, moved, light, exposure, shown.stale, direct=shown.direct))
+    if present < len(_live.shown):  # one was renamed or removed, which Blender may not tell
+        _live.bakes_dirty = True
+        _schedule(SHORTEST_WAIT)
     return items
+
+
+def _is_drawn(found: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
+    """Whether an object with a bake is shown lit: not while it is edited or painted, nor as wires."""
+    return found.mode == "OBJECT" and found.display_type not in OUTLINES and found.visible_in_viewport_get(space)
 
 
 def shows_everything() -> bool:
     """Whether every surface that this region shows is drawn by us: then Blender's depth is not needed (its floor grid
     and jittered samples are in it)."""
     space = bpy.context.space_data
-    return all(found.name in _live.shown or found.type not in SURFACE_TYPES or not found.visible_in_viewport_get(space)
-               or found.display_type in ("BOUNDS", "WIRE")
-               for found in bpy.context.view_layer.objects)
+    for found in bpy.context.view_layer.objects:
+        has_surface = found.type in SURFACE_TYPES and found.display_type not in OUTLINES
+        if (has_surface or found.instance_type != "NONE") and found.visible_in_viewport_get(space) and not (
+                found.name_full in _live.shown and _is_drawn(found, space) and not found.particle_systems):
+            return False
+    return True
 
 
 def labels() -> list[tuple[str, tuple[float, ...]]]:
@@ -139,26 +207,28 @@ def labels() -> list[tuple[str, tuple[float, ...]]]:
 
 def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Distant light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
-    if _live.light is None:
-        return None
-    scale = np.sqrt((moved[:3, :3] ** 2).sum(axis=0))
-    turn = moved[:3, :3] / np.where(scale > 0.0, scale, 1.0)
-    if np.abs(turn - np.eye(3)).max() < 1e-5 or np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:  # small
-        return _live.light  # not turned, or sheared: then the bake is stale anyway
-    key = turn.round(6).tobytes()
+    if _live.light is None or not is_turned(moved):
+        return _live.light
+    key = moved[:3, :3].round(6).tobytes()
     if key not in _live.rotated:
-        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: rotate(_live.light, turn.T)}
+        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: distant_light_in(_live.light, moved)}
     return _live.rotated[key]
+
+
+def _known_bakes() -> Hashable:
+    """Changes when objects with bakes come, go, are renamed, get another bake or leave edit mode. Cheap."""
+    layer = bpy.context.view_layer.objects
+    carriers = ((found, baked_mesh(found)) for found in baked_objects(bpy.context.scene))
+    return tuple((found.name_full, mesh.session_uid, mesh.is_editmode, found.name in layer) for found, mesh in carriers)
 
 
 def _read_bakes() -> None:
     """Read all baked objects of the scene; what can't be read is not shown, and the panel says why."""
-    scene, state = bpy.context.scene, session()
-    _live.bakes_dirty, _live.shown = False, {}
-    state.objects.clear()
-    for found in baked_objects(scene):
-        line = state.objects.add()
-        line.name = found.name
+    _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known_bakes()
+    layer = {found.name_full for found in bpy.context.view_layer.objects}
+    for found in baked_objects(bpy.context.scene):
+        line = Line(found.name_full)
+        _live.lines.append(line)
         try:
             baked = read_baked(found)
         except PRTError as error:
@@ -173,9 +243,23 @@ def _read_bakes() -> None:
         line.overdraw_before = float(coherence.get("before", 0.0))
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
         line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
-        _live.shown[found.name] = Shown(baked, (found.name, transfer_signature(baked)))
-    assign(state, cloud="\n".join(_cloud_lines()))
+        if found.name_full in layer:
+            _live.shown[found.name_full] = Shown(baked, (_context_key(), found.name_full, transfer_signature(baked)))
     _read_stale()
+
+
+def _tell_panel() -> None:
+    """Pass on to the panel what is known of the scene of this context."""
+    state = session()
+    assign(state, cloud="\n".join(_cloud_lines()), preview_message=_live.message if state.preview else "")
+    if [line.name for line in state.objects] != [line.name for line in _live.lines]:
+        state.objects.clear()
+        for line in _live.lines:
+            state.objects.add().name = line.name
+    for told, line in zip(state.objects, _live.lines, strict=True):
+        # Blender keeps floats in single precision.
+        assign(told, **{name: float(np.float32(value)) if isinstance(value, float) else value
+                        for name, value in vars(line).items()})
 
 
 def _cloud_lines() -> list[str]:
@@ -219,13 +303,22 @@ def _read_stale() -> None:
     started = time.perf_counter()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
-    for line in session().objects:
-        found, shown = bpy.data.objects.get(line.name), _live.shown.get(line.name)
+    objects = {found.name_full: found for found in bpy.context.scene.objects}
+    changed = False
+    for line in _live.lines:
+        found, shown = objects.get(line.name), _live.shown.get(line.name)
         if found is None or shown is None:
             continue
-        why = stale(found, depsgraph, around) or ""
-        shown.stale = bool(why)
-        assign(line, stale=why)
+        before = shown.stale, shown.moved
+        try:
+            line.stale = stale(found, depsgraph, around) or ""
+        except PRTError as error:
+            line.stale = str(error)
+        shown.stale = bool(line.stale)
+        shown.moved = None if shown.stale else transform_since_bake(found, shown.baked.header)
+        changed |= before[0] != shown.stale or not np.array_equal(before[1], shown.moved)
+    if changed and any(shown.baked.cloud is not None for shown in _live.shown.values()):
+        _live.lamps_signature, _live.light_dirty = None, True
     _live.stale_seconds = time.perf_counter() - started
 
 
@@ -233,7 +326,7 @@ def _read_light() -> None:
     """Evaluate the scene's light when it changed; the viewport redraws only then."""
     _live.light_dirty = False
     if not _live.shown:
-        _live.signature = _live.light = None
+        _live.signature, _live.light, _live.message = None, None, ""
         return
     started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
     warnings: list[str] = []
@@ -247,7 +340,7 @@ def _read_light() -> None:
         warnings += found.warnings
     _read_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
-    assign(session(), preview_message="\n".join(dict.fromkeys(warnings)))
+    _live.message = "\n".join(dict.fromkeys(warnings))
     if (order, signature) != _live.signature:
         _live.signature, _live.light, _live.rotated = (order, signature), distant, {}
         viewport.redraw()
@@ -256,7 +349,8 @@ def _read_light() -> None:
 def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     """Let the lamps' light follow; while some of it still fades, ask for the next step."""
     now, baked = time.perf_counter(), {name: shown.baked for name, shown in _live.shown.items()}
-    lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time)
+    moves = {name: shown.moved for name, shown in _live.shown.items() if shown.moved is not None}
+    lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time, moves)
     _live.lamps_time = now
     _note_moves(lamps, now)
     signature = lamps_signature(lamps), frozenset(_live.moving)
@@ -264,7 +358,7 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
             shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature = signature
         for name, shown in _live.shown.items():
-            shown.direct = _live.lamps.direct(name, shown.baked, lamps, _live.moving)
+            shown.direct = _live.lamps.direct(name, shown.baked, lamps, _live.moving, shown.moved)
         viewport.redraw()
     if not _live.lamps.settled:
         _live.light_dirty = True
@@ -285,17 +379,24 @@ def _note_moves(lamps: list[LocalLight], now: float) -> None:
 
 def _refine() -> float | None:
     """Once no lamp moves any more, have their light evaluated as if none had; the seconds until it is to ask again."""
-    left = _live.moved_time + STILL_SECONDS - time.perf_counter()
+    moving = [live for live in _lives.values() if live.moving]
+    left = max((live.moved_time for live in moving), default=0.0) + STILL_SECONDS - time.perf_counter()
     if left > 0.0:
         return left
-    if _live.moving:
+    if moving:
         light_changed()
     return None
 
 
 def _schedule(wait: float) -> None:
-    if not bpy.app.background and not bpy.app.timers.is_registered(_catch_up):
-        bpy.app.timers.register(_catch_up, first_interval=wait, persistent=True)
+    """Have `_catch_up` run after so many seconds, or earlier where it is due."""
+    due = time.perf_counter() + wait
+    if bpy.app.background or (bpy.app.timers.is_registered(_catch_up) and due >= Live.due):
+        return
+    if bpy.app.timers.is_registered(_catch_up):
+        bpy.app.timers.unregister(_catch_up)
+    Live.due = due
+    bpy.app.timers.register(_catch_up, first_interval=wait, persistent=True)
 
 
 def _catch_up() -> float | None:
@@ -303,26 +404,46 @@ def _catch_up() -> float | None:
     windows = bpy.context.window_manager.windows
     if not windows:
         return None
-    _live.working = True
+    Live.working, waits, keys = True, [], set()
     assign(session(), preview=viewport.is_enabled())  # loading a file with its windows starts a new session
     try:
+        for window in windows:
+            with bpy.context.temp_override(window=window):
+                if _context_key() not in keys:
+                    keys.add(_context_key())
+                    waits.append(_follow())
         with bpy.context.temp_override(window=windows[0]):
-            if _live.bakes_dirty:
-                _read_bakes()
-            if _live.stale_dirty:
-                _read_stale()
-            if _live.light_dirty and session().preview:
-                _read_light()
-    except PRTError as error:
-        assign(session(), preview_message=str(error))
+            _tell_panel()
     finally:
-        _live.working = False
+        Live.working = False
+    for key in _lives.keys() - keys:  # no window shows it any more
+        del _lives[key]
     viewport.redraw()
-    if _live.light_dirty and session().preview:  # light that fades
-        return max(SHORTEST_WAIT, _live.light_seconds)
+    waits = [wait for wait in waits if wait is not None]
+    if waits:
+        Live.due = time.perf_counter() + min(waits)
+        return min(waits)
     if not bpy.app.timers.is_registered(_note_viewport):
         bpy.app.timers.register(_note_viewport, first_interval=NOTE_WAIT, persistent=True)
     return None
+
+
+def _follow() -> float | None:
+    """Do for the scene of this context what is to be done; the seconds until there is more."""
+    now = time.perf_counter()
+    try:
+        if _live.bakes_dirty or _live.known != _known_bakes():
+            _live.light_dirty = True
+            _read_bakes()
+        if _live.stale_dirty and now >= _live.stale_due:
+            _read_stale()
+        if _live.light_dirty and session().preview:
+            _read_light()
+    except PRTError as error:
+        _live.message = str(error)
+    if _live.light_dirty and session().preview:  # light that fades
+        return max(SHORTEST_WAIT, _live.light_seconds)
+    return max(SHORTEST_WAIT, _live.stale_due - now) if _live.stale_dirty else None
 
 
 def _note_viewport() -> None:
@@ -334,34 +455,53 @@ def _note_viewport() -> None:
 
 @persistent
 def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Note whether the light or a baked mesh changed."""
-    if _live.working or not _live.shown:
-        return
+    """Note whether the light, a baked mesh or what is around it changed."""
+    if not Live.working:
+        _note(depsgraph)
+
+
+def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
+    """Note what a depsgraph's updates may have changed. light: whether that has changed for certain."""
+    geometry, asked = False, light
     for update in depsgraph.updates:
         changed = update.id
+        asked |= isinstance(changed, LISTED_TYPES)
         if isinstance(changed, LIGHT_TYPES):
-            _live.light_dirty = True
+            light = True
         elif isinstance(changed, bpy.types.Object):
-            _live.light_dirty |= changed.type == "LIGHT"
-            _live.stale_dirty |= changed.type == "MESH"
-    if _live.light_dirty and session().preview:
-        _schedule(max(SHORTEST_WAIT, _live.light_seconds))
-    elif _live.stale_dirty:
-        _schedule(max(STALE_WAIT, 4.0 * _live.stale_seconds))
+            light |= changed.type == "LIGHT"
+            geometry |= changed.type in SURFACE_TYPES or changed.instance_type != "NONE"
+        elif isinstance(changed, SURFACE_DATA):
+            geometry = True
+    now = time.perf_counter()
+    for live in _lives.values():
+        live.light_dirty |= light
+        if geometry and not live.stale_dirty:
+            live.stale_dirty, live.stale_due = True, now + max(STALE_WAIT, 4.0 * live.stale_seconds)
+    if light and session().preview:
+        _schedule(max([SHORTEST_WAIT, *(live.light_seconds for live in _lives.values())]))
+    elif geometry or asked:
+        _schedule(max([STALE_WAIT, *(4.0 * live.stale_seconds for live in _lives.values())]))
 
 
 @persistent
-def _on_frame_change(_scene: bpy.types.Scene, _depsgraph: bpy.types.Depsgraph) -> None:
-    """An animated light moves without a depsgraph update of its own."""
-    _live.light_dirty = True
-    if session().preview:
-        _schedule(max(SHORTEST_WAIT, _live.light_seconds))
+def _on_frame_change(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """What is animated moves without a depsgraph update of its own."""
+    _note(depsgraph, light=True)
 
 
 @persistent
 def _on_data_replaced(*_arguments: object) -> None:
-    """A file was loaded, or undo replaced all data."""
-    _live.signature = None
+    """Undo replaced all data."""
+    for live in _lives.values():
+        live.signature = None
+    bakes_changed()
+
+
+@persistent
+def _on_load(*_arguments: object) -> None:
+    """A file was loaded: nothing of the last one counts."""
+    _lives.clear()
     bakes_changed()
 
 
@@ -370,7 +510,7 @@ HANDLERS = (
     (bpy.app.handlers.frame_change_post, _on_frame_change),
     (bpy.app.handlers.undo_post, _on_data_replaced),
     (bpy.app.handlers.redo_post, _on_data_replaced),
-    (bpy.app.handlers.load_post, _on_data_replaced),
+    (bpy.app.handlers.load_post, _on_load),
 )
 
 
@@ -389,4 +529,4 @@ def unregister() -> None:
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     disable()
-    _live.shown.clear()
+    _lives.clear()

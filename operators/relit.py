@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.lights import light_coefficients
-from ..prt_addon.blender.stored import baked_objects, read_baked, stale
+from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import BadScene
 from ..prt_addon.relighting.exit_radiance import view_radiance
+from ..prt_addon.relighting.moved_light import distant_light_in
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .scene_lamps import SceneLamps
@@ -22,11 +23,12 @@ from .scene_lamps import SceneLamps
 
 @dataclass(frozen=True)
 class Lit:
-    """By name of the baked object: light in its columns, and direct light of lamps (None for none); warnings for the
-    user, each once."""
+    """By name of the baked object: light in its columns, and direct light of lamps (None for none), both as the bake
+    sees them; moved: (4, 4) from where it was baked to where it is now; warnings for the user, each once."""
 
     light: dict[str, NDArray[np.float32]]
     direct: dict[str, NDArray[np.float32] | None]
+    moved: dict[str, NDArray[np.float64]]
     warnings: tuple[str, ...]
 
     def radiance(self, name: str, baked: BakedTransfer) -> NDArray[np.float32]:
@@ -62,9 +64,12 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
         found = light_coefficients(scene, depsgraph, order, environment, rotate, use_scene_lights, window,
                                    all(b.cloud is None for b in baked.values()))
         distant, warnings = found.coefficients, list(found.warnings)
+    moved = {name: transform_since_bake(scene.objects[name], b.header) for name, b in baked.items()}
     scene_lamps = SceneLamps()
-    lamps = scene_lamps.step(baked, depsgraph, warnings) if use_scene_lights else []
-    local = {name: scene_lamps.cloud_light(b) if lamps else None for name, b in baked.items()}
-    return Lit({name: joined_light(b.lighting_basis, distant, local[name]) for name, b in baked.items()},
-               {name: scene_lamps.direct(name, b, lamps) if lamps else None for name, b in baked.items()},
-               tuple(dict.fromkeys(warnings)))
+    lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
+    light, direct = {}, {}
+    for name, b in baked.items():
+        seen = None if distant is None else distant_light_in(distant, moved[name])
+        light[name] = joined_light(b.lighting_basis, seen, scene_lamps.cloud_light(b, moved[name]) if lamps else None)
+        direct[name] = scene_lamps.direct(name, b, lamps, moved=moved[name]) if lamps else None
+    return Lit(light, direct, moved, tuple(dict.fromkeys(warnings)))

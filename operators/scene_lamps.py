@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Hashable, Sequence
+from collections.abc import Container, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import bpy
@@ -26,12 +26,15 @@ from ..prt_addon.relighting.lamp_light import (
     lamp_shape,
     lamps_in,
 )
+from ..prt_addon.relighting.moved_light import lamp_in, points_in
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
 from ..prt_addon.tracing.tracer import Tracer
 
+Move = NDArray[np.float64] | None
+Moves = Mapping[str, NDArray[np.float64]]
 HIDDEN = "Lamps: all objects that are baked for them are hidden in renders, so they light nothing"
 OUTSIDE = "{}: outside the light cloud, so it is shown without bounced light"
 UNLIT = "{}: too far from the light cloud's lights in sight for part of the scene's bounced light"
@@ -41,23 +44,25 @@ UNLIT = "{}: too far from the light cloud's lights in sight for part of the scen
 class SceneLamps:
     """Lamps on baked objects. Everything that depends on geometry is kept until `forget_geometry`."""
 
-    _tracer: Tracer | None = None
-    _clouds: dict[str, LampLight | SurfaceLamps] = field(default_factory=dict)
-    _lit: dict[str, CloudLight] = field(default_factory=dict)
-    _direct: dict[str, DirectLight] = field(default_factory=dict)
+    _scene: SceneMesh | None = None
+    _tracers: dict[bytes, Tracer] = field(default_factory=dict)  # by the move of the bake's set
+    _clouds: dict[tuple[str, bytes], LampLight | SurfaceLamps] = field(default_factory=dict)
+    _lit: dict[tuple[str, bytes], CloudLight] = field(default_factory=dict)
+    _direct: dict[tuple[str, bytes], DirectLight] = field(default_factory=dict)
 
     def forget_geometry(self) -> None:
         """Something moved or changed its shape: shadows are to be found anew."""
-        self._tracer = None
+        self._scene = None
+        self._tracers.clear()
         self._clouds.clear()
         self._direct.clear()
 
     def step(self, baked: dict[str, BakedTransfer], depsgraph: bpy.types.Depsgraph,
-             warnings: list[str], seconds: float = AT_ONCE) -> list[LocalLight]:
+             warnings: list[str], seconds: float = AT_ONCE, moves: Moves | None = None) -> list[LocalLight]:
         """Read the lamps and let their light in each cloud follow; `cloud_light` and `direct` then tell it.
 
-        baked: objects by name; only those with a light cloud count. seconds: since the last step. Lamps that are
-        outside a cloud are named in warnings.
+        baked: objects by name; only those with a light cloud count. seconds: since the last step. moves: (4, 4) of each
+        object since its bake, where it was moved. Lamps that are outside a cloud are named in warnings.
         """
         near = {name: b for name, b in baked.items() if b.cloud is not None}
         if not near:
@@ -70,18 +75,17 @@ class SceneLamps:
             warnings.append(HIDDEN)
             return []
         lamps = read_local_lights(depsgraph, warnings)
-        if self._tracer is None:
-            scene = SceneMesh.assemble(read_objects(depsgraph, casting, []), 0.0)
-            # In Blender's own process nothing starts threads (design/architecture.md).
-            self._tracer = Tracer(scene.points, scene.triangles, threads=1)
+        if self._scene is None:
+            self._scene = SceneMesh.assemble(read_objects(depsgraph, casting, []), 0.0)
         self._lit = {}
-        for transfer in near.values():
-            key = cloud_key(transfer)
+        for name, transfer in near.items():
+            moved = (moves or {}).get(name)
+            key = cloud_key(transfer), _move_key(moved)
             if key in self._lit:
                 continue
             if key not in self._clouds:
-                self._clouds[key] = lamps_in(transfer.cloud, self._tracer)
-            self._lit[key] = self._clouds[key].step(lamps, seconds)
+                self._clouds[key] = lamps_in(transfer.cloud, self._traced(moved))
+            self._lit[key] = self._clouds[key].step(_as_seen(lamps, moved), seconds)
         for found in self._lit.values():
             warnings += [OUTSIDE.format(name) for name in found.outside] + [UNLIT.format(name) for name in found.unlit]
         return lamps
@@ -96,23 +100,45 @@ class SceneLamps:
         """Whether nothing fades any more."""
         return all(found.settled for found in self._lit.values())
 
-    def cloud_light(self, baked: BakedTransfer) -> NDArray[np.float32] | None:
-        """The lamps' light (zones, columns, 3) in the cloud of a bake; None without a cloud."""
-        found = self._lit.get(cloud_key(baked)) if baked.cloud is not None else None
+    def cloud_light(self, baked: BakedTransfer, moved: Move = None) -> NDArray[np.float32] | None:
+        """The lamps' light (zones, columns, 3) in the cloud of a bake, moved since as `step` was told; None without a
+        cloud, and where `step` has not heard of it."""
+        found = self._lit.get((cloud_key(baked), _move_key(moved))) if baked.cloud is not None else None
         return None if found is None else found.values
 
     def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
-               moving: Container[str] = ()) -> NDArray[np.float32] | None:
+               moving: Container[str] = (), moved: Move = None) -> NDArray[np.float32] | None:
         """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud, or before `step`.
 
-        moving: keys of lamps that are being dragged, whose soft shadows may be coarse.
+        moving: keys of lamps that are being dragged, whose soft shadows may be coarse. moved: of the object since its
+        bake.
         """
-        if baked.cloud is None or self._tracer is None:
+        if baked.cloud is None or self._scene is None:
             return None
-        if name not in self._direct:
-            self._direct[name] = DirectLight(self._tracer, baked)
+        key = name, _move_key(moved)
+        if key not in self._direct:
+            self._direct[key] = DirectLight(self._traced(moved), baked)
         samples = [QUICK_SAMPLES if lamp.key in moving else SHADOW_SAMPLES for lamp in lamps]
-        return self._direct[name].of(lamps, samples)
+        return self._direct[key].of(_as_seen(lamps, moved), samples)
+
+    def _traced(self, moved: Move) -> Tracer:
+        """Of everything that casts shadows, where the bake saw it."""
+        key = _move_key(moved)
+        if key not in self._tracers:
+            points = self._scene.points if moved is None else points_in(self._scene.points, moved)
+            # In Blender's own process nothing starts threads (design/architecture.md).
+            self._tracers[key] = Tracer(points, self._scene.triangles, threads=1)
+        return self._tracers[key]
+
+
+def _move_key(moved: Move) -> bytes:
+    """The same for the same move of a whole set: its objects' own transforms round differently."""
+    return b"" if moved is None or np.array_equal(moved, np.eye(4)) else np.round(moved, 4).tobytes()
+
+
+def _as_seen(lamps: Sequence[LocalLight], moved: Move) -> Sequence[LocalLight]:
+    """Lamps as a bake sees them that was moved."""
+    return lamps if moved is None else [lamp_in(lamp, moved) for lamp in lamps]
 
 
 def lamps_signature(lamps: Sequence[LocalLight]) -> Hashable:

@@ -23,6 +23,7 @@ from ..prt_addon.blender.image_albedo import surface_textures
 from ..prt_addon.blender.lights import environment_picture
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.errors import BadArguments, StorageError
+from ..prt_addon.relighting.moved_light import moved_normals, moved_points
 from ..prt_addon.reporting.headline import headline
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
@@ -77,8 +78,8 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
     radiances = [lit.radiance(name, b) for name, b in baked.items()]
     save_arrays(arguments.output, {
         "radiance": np.concatenate(radiances).astype(np.float32),
-        "position": np.concatenate([b.positions for b in baked.values()]),
-        "normal": np.concatenate([b.normals for b in baked.values()]),
+        "position": np.concatenate([moved_points(b.positions, lit.moved[n]) for n, b in baked.items()]).astype("f4"),
+        "normal": np.concatenate([moved_normals(b.normals, lit.moved[n]) for n, b in baked.items()]).astype("f4"),
         "albedo": np.concatenate([b.albedo for b in baked.values()]),
         "object": np.concatenate([np.full(len(b.cluster), name) for name, b in baked.items()]),
     })
@@ -98,7 +99,7 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
     width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
                                        max(1, round(scene.render.resolution_y * percentage)))
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    items = [DrawItem(name, b, np.eye(4), lit.light[name], direct=lit.direct[name],  # small: what moved is refused
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name],
                       textures=surface_textures(scene.objects[name], b, depsgraph)) for name, b in baked.items()]
     background = None
     if not scene.render.film_transparent:

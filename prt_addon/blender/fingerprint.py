@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..storage.digests import digest_arrays, digest_json
+from .bake_set import pack_place
 from .materials import material_digest
 from .nodes import reachable
 from .visibility import render_visible_objects
@@ -105,22 +107,57 @@ def fingerprint(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) 
 
 
 def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
-    """Digest per render-visible object with geometry of its place and shape: all that can shadow or light another.
+    """What each render-visible piece of geometry is and where it stands: all that can shadow or light another.
 
-    One pass over all meshes; call it once for all baked objects, not per object and redraw.
+    By name of the object, or of instancer and instanced object: a digest of shape and materials, then the place
+    (`bake_set.pack_place`), so that it can be told whether everything moved together. One pass over all meshes; call it
+    once for all baked objects, not per object and redraw.
     """
     visible = render_visible_objects(depsgraph.view_layer)
-    parts: dict[str, list[str]] = {}
-    cache: dict[int, str] = {}
+    shapes: dict[str, str] = {}
+    places: dict[str, list[NDArray[np.float64]]] = {}
+    meshes: dict[int, str] = {}
     for instance in depsgraph.object_instances:
-        owner = (instance.parent if instance.is_instance else instance.object).original
-        mesh = instance.object.data
+        owner, source = (instance.parent if instance.is_instance else instance.object).original, instance.object
+        mesh = source.data
         if owner.name_full not in visible or not isinstance(mesh, bpy.types.Mesh) or (
-                instance.object.original != owner and instance.object.original.hide_render):
+                source.original != owner and source.original.hide_render):
             continue
         pointer = mesh.as_pointer()
-        if pointer not in cache:
-            cache[pointer] = _mesh_digest(mesh)
-        place = np.array(instance.matrix_world, np.float32) + np.float32(0.0)
-        parts.setdefault(owner.name_full, []).extend((cache[pointer], digest_arrays(place)))
-    return {name: digest_json(digests) for name, digests in parts.items()}
+        if pointer not in meshes:
+            meshes[pointer] = _mesh_digest(mesh)
+        place = np.array(instance.matrix_world, np.float64)
+        # Geometry that nodes made has its instancer for a source, and many meshes.
+        name = owner.name_full if source.original == owner else f"{owner.name_full}/{source.original.name_full}"
+        key = f"{name}/{mesh.name_full}" if instance.is_instance and source.original == owner else name
+        if key not in places:
+            shapes[key] = _shape_digest(meshes[pointer], source, place)
+        places.setdefault(key, []).append(place)
+    return {key: _with_place(shapes[key], found) for key, found in places.items()}
+
+
+def _shape_digest(mesh: str, source: bpy.types.Object, place: NDArray[np.float64]) -> str:
+    """Of a mesh with the materials of the object that shows it; with its size where that counts: light travels through
+    bodies by a length of its own."""
+    materials = used_materials(source)
+    parts = [mesh, material_digest(materials)]
+    if any(_is_translucent(node) for material in dict.fromkeys(materials) for node in _nodes_of(material)):
+        volume = np.linalg.det(place[:3, :3])  # small
+        parts.append(f"{abs(volume) ** (1.0 / 3.0):.4g}")
+    return digest_json(parts)
+
+
+def _is_translucent(node: bpy.types.Node) -> bool:
+    if node.bl_idname != "ShaderNodeBsdfPrincipled":
+        return node.bl_idname == "ShaderNodeSubsurfaceScattering"
+    weight = node.inputs["Subsurface Weight"]
+    return weight.is_linked or weight.default_value > 0.0
+
+
+def _with_place(shape: str, places: list[NDArray[np.float64]]) -> str:
+    """One entry: of several places the first, and how the others stand to it (rounded, as it survives moves)."""
+    if len(places) > 1:
+        to_first = np.linalg.pinv(places[0])  # small
+        others = sorted((np.round(to_first @ place, 4) + 0.0).tolist() for place in places[1:])  # small
+        shape = digest_json([shape, others])
+    return shape + pack_place(places[0])

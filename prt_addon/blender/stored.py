@@ -19,16 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import StorageError
+from ..relighting.moved_light import similarity
 from ..scene.tangents import tangent_frame
 from ..storage import container
 from ..storage.container import BakedTransfer
 from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
+from .bake_set import changed_piece
 from .fingerprint import fingerprint, geometry_digest, material_digest, used_materials
 from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
 NORMAL_ATTRIBUTE, TANGENT_ATTRIBUTE = "prt_normal", "prt_tangent"
 RECEIVER_PROPERTY = "prt_receiver"
 RECEIVER_NAME = "PRT {}"
+MOVED = "it was moved, turned or scaled since the bake, and not all that is around it came along"
 MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
 OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE,
         TANGENT_ATTRIBUTE, container.MATERIAL_ATTRIBUTE, container.ERROR_ATTRIBUTE, container.SOURCE_ATTRIBUTE)
@@ -158,8 +161,9 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
           surroundings: dict[str, str] | None = None) -> str | None:
     """Why an object's bake no longer fits the scene, as a clause for the user; None while it does or without a bake.
 
-    surroundings: of now, from `fingerprint.surroundings`, if what else moved shall count too. Raises StorageError where
-    the header can't be read.
+    A bake fits as long as everything keeps its place relative to everything else (`transform_since_bake` tells where it
+    went). surroundings: of now, from `fingerprint.surroundings`, if what else moved shall count too; without them a
+    move of the object alone makes it stale. Raises StorageError where the header can't be read.
     """
     header = stored_header(scene_object)
     if header is None:
@@ -168,29 +172,34 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     geometry = geometry_digest(scene_object, depsgraph)
     if geometry is not None and digests.get("geometry") != geometry:
         return "its mesh or modifiers changed since the bake"
-    if not _same_place(np.array(scene_object.matrix_world, np.float64), _header_matrix(header, scene_object.name)):
-        return "it was moved, turned or scaled since the bake"
     if digests.get("materials") != material_digest(used_materials(scene_object)):
         return "its materials changed since the bake"
-    return _changed_surroundings(digests.get("surroundings"), surroundings, scene_object.name_full)
+    moved, then = transform_since_bake(scene_object, header), digests.get("surroundings")
+    stays = np.array_equal(moved, np.eye(4))
+    if not stays and (then is None or surroundings is None or similarity(moved) is None):
+        return MOVED
+    if then is None or surroundings is None:
+        return None
+    if stays:  # of itself more has been asked above
+        then, surroundings = ({name: entry for name, entry in entries.items() if name != scene_object.name_full}
+                              for entries in (then, surroundings))
+    try:
+        changed = changed_piece(then, surroundings, moved)
+    except ValueError as error:
+        raise StorageError(scene_object.name, f"the header of its baked data states no valid digests ({error})",
+                           container.REBAKE) from error
+    if changed is None:
+        return None
+    # A whole scene that moves together keeps its light; one object that moves alone does not.
+    return f"{changed}, which can shadow or light it, changed since the bake" if stays else MOVED
 
 
 def _stored_digests(header: dict, subject: str) -> dict:
     digests = header.get("digests", {})
-    if not isinstance(digests, dict) or not isinstance(digests.get("surroundings"), dict | None):
+    around = digests.get("surroundings") if isinstance(digests, dict) else ""
+    if not isinstance(around, dict | None) or not all(isinstance(entry, str) for entry in (around or {}).values()):
         raise StorageError(subject, "the header of its baked data states no valid digests", container.REBAKE)
     return digests
-
-
-def _changed_surroundings(then: dict[str, str] | None, now: dict[str, str] | None, own_name: str) -> str | None:
-    if then is None or now is None:
-        return None
-    # Compared by content: a renamed object casts the same shadow.
-    gone = [name for name, digest in then.items() if digest not in now.values() and name != own_name]
-    new = [name for name, digest in now.items() if digest not in then.values() and name != own_name]
-    if gone or new:
-        return f"{(new or gone)[0]}, which can shadow or light it, changed since the bake"
-    return None
 
 
 def _same_place(now: NDArray[np.float64], then: NDArray[np.float64]) -> bool:

@@ -44,19 +44,19 @@ def test_a_dragged_lamp_gets_few_rays_and_one_that_stays_none(room: Path) -> Non
     bpy.context.view_layer.update()
     lamps = lamps_of.step(baked, depsgraph, [])
     assert moved_lamps(lamps, before) == {"Lamp"} and not moved_lamps(lamps, lamps) and not moved_lamps(lamps, [])
-    rays = lamps_of._tracer.rays
+    rays = lamps_of._tracers[b""].rays
     quick = lamps_of.direct("Floor", baked["Floor"], lamps, {"Lamp"})
-    few = lamps_of._tracer.rays - rays
+    few = lamps_of._tracers[b""].rays - rays
     fine = lamps_of.direct("Floor", baked["Floor"], lamps)
-    assert lamps_of._tracer.rays - rays - few > 3 * few > 0
+    assert lamps_of._tracers[b""].rays - rays - few > 3 * few > 0
     assert np.abs(quick - fine).max() < 0.5 * fine.max() and np.abs(quick - still).max() > 0.1 * still.max()
     bpy.data.lights["Lamp"].energy *= 2.0
     bpy.context.view_layer.update()
     bright = lamps_of.step(baked, depsgraph, [])
-    rays = lamps_of._tracer.rays
+    rays = lamps_of._tracers[b""].rays
     assert not moved_lamps(bright, lamps)
     assert np.allclose(lamps_of.direct("Floor", baked["Floor"], bright), 2.0 * fine, rtol=1e-5)
-    assert lamps_of._tracer.rays == rays
+    assert lamps_of._tracers[b""].rays == rays
 
 
 def test_baked_objects_hidden_in_renders_hide_nothing_and_break_nothing(room: Path) -> None:

@@ -69,4 +69,5 @@ def main(path: str) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=path)
 
 
-main(sys.argv[sys.argv.index("--") + 1])
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1])

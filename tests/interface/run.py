@@ -31,6 +31,8 @@ SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
+    "views": ("views_in_blender.py", "make_views.py"),
+    "display": ("display_in_blender.py", "make_display.py"),
 }
 COMMAND_SECONDS = 240
 
