@@ -19,7 +19,7 @@ from ..scene.surface_textures import SurfaceTextures, TextureUse, places_on_part
 from ..storage.container import BakedTransfer
 from ..storage.digests import digest_arrays
 from .nodes import Groups, constant_of, origin_of
-from .read_scene import transform_rows
+from .read_scene import is_flattened, transform_rows
 
 WHITE = (1.0, 1.0, 1.0)
 IMAGE_SOURCES = {"FILE", "GENERATED"}  # no tiles, sequences or films
@@ -155,7 +155,9 @@ def surface_textures(scene_object: bpy.types.Object, baked: BakedTransfer, depsg
                      ) -> SurfaceTextures | None:
     """Textures of an object's baked triangles; None where no material shows an image through a UV map, or where the
     bake does not know its source triangles or these are no more those of the object."""
-    if baked.source is None or not any(texture_of(slot.material) for slot in scene_object.material_slots):
+    placed_now = np.array(scene_object.matrix_world, np.float64)
+    if baked.source is None or is_flattened(placed_now) or not any(
+            texture_of(slot.material) for slot in scene_object.material_slots):
         return None
     parts = _placed_parts(scene_object, depsgraph)
     source = [np.concatenate(arrays) for arrays in zip(*[part[:3] for part in parts], strict=True)] if parts else None
