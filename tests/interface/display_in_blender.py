@@ -33,8 +33,6 @@ from driving import (
 
 ALL = {"Ball", "Floor", "Statue", "Wall"}
 TILE = 0.5  # metres, of the checker on the floor
-# Display levels of the two tiles in the file, (0.85, 0.8, 0.7) and (0.15, 0.2, 0.35): light differs, which is which not.
-LIGHT_TILE, DARK_TILE = 0.80, 0.20
 
 
 def settings() -> bpy.types.PropertyGroup:
@@ -65,6 +63,7 @@ def open_and_bake() -> Step:
     space.region_3d.view_rotation = (0.82, 0.49, 0.15, 0.26)
     space.region_3d.view_distance, space.region_3d.view_location = 7.5, (0.2, 0.0, 0.6)
     bpy.context.scene.view_settings.view_transform = "Standard"
+    yield 1.5
     region("UI").active_panel_category = "PRT"
     bpy.context.scene.cursor.location = (0.0, 0.0, -5.0)  # out of the pictures
     settings().preset, settings().lighting, settings().lamp_basis = "draft", "both", "surfaces"
