@@ -215,7 +215,11 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
     if not items:
         return
     view_projection = np.array(bpy.context.region_data.perspective_matrix, np.float64)
+    clear = viewport.is_complete() or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine)
     if not all(item.is_lit for item in items):  # false colours: the overlays' buffer gets no view transform
+        viewport.status.colour_managed, viewport.status.fallback = True, ""
+        if clear:
+            gpu.state.active_framebuffer_get().clear(depth=1.0)
         viewport.cache.draw(items, view_projection)
         return
     reason = _why_not_usable(framebuffer, bpy.context.region)
@@ -224,7 +228,7 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
         viewport.cache.draw(items, view_projection)
         return
     with framebuffer.bind():
-        if viewport.is_complete() or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
+        if clear:
             framebuffer.clear(depth=1.0)
         viewport.cache.draw(items, view_projection)
 

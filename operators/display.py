@@ -8,6 +8,7 @@ Everything is made once for what is shown and then only handed out: it is asked 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
@@ -27,35 +28,36 @@ UNKNOWN = (0.05, 0.05, 0.05)  # scene-linear, where there is nothing to show
 # Of the receivers, how many may be beyond the legend's end: a few bad ones must not make all others dark.
 BEYOND = 0.002
 LEGEND_STEPS = 64
+LEAST, MOST = 0.15, 0.8  # of the heat that vectors are shown in
 DENSE, MERGED, BOX = (0.75, 0.75, 0.75, 0.6), 7.0, (0.9, 0.9, 0.9, 0.6)
 PATCH_ALPHA = 0.8
 
-Shown = Mapping[str, tuple[Hashable, BakedTransfer]]  # key and bake by object
+Shown = Mapping[str, BakedTransfer]  # by object; another bake is another BakedTransfer
 
 
 @dataclass
 class Display:
     """What was made for one scene, and for what."""
 
-    key: Hashable = None
+    mode: str = RELIT
+    made_of: tuple[BakedTransfer, ...] = ()
     colours: dict[str, FalseColours] = field(default_factory=dict)
     legend: Legend | None = None
     overlays: dict[Hashable, tuple[Overlay, ...]] = field(default_factory=dict)
 
     def colours_of(self, mode: str, shown: Shown) -> dict[str, FalseColours]:
         """False colours by object; none where light is shown."""
-        key = mode, tuple(key for key, _ in shown.values())
-        if key != self.key:
-            bakes = {name: baked for name, (_, baked) in shown.items()}
-            self.colours, self.legend = MAKERS[mode](bakes) if mode in MAKERS and bakes else ({}, None)
-            self.key = key
+        same = len(self.made_of) == len(shown) and all(map(operator.is_, self.made_of, shown.values()))
+        if mode != self.mode or not same:
+            self.mode, self.made_of = mode, tuple(shown.values())
+            self.colours, self.legend = MAKERS[mode](shown) if mode in MAKERS and shown else ({}, None)
         return self.colours
 
     def marks(self, shown: Shown, moves: Mapping[str, NDArray[np.float64] | None], show_cloud: bool) -> Marks:
         """The legend, and the lights or patches of each cloud once, moved as the first object of it is."""
         found = {}
         if show_cloud:
-            for name, (_, baked) in shown.items():
+            for name, baked in shown.items():
                 if baked.cloud is not None:
                     found.setdefault(cloud_key(baked), (name, baked.cloud))
         self.overlays = {key: self.overlays.get(key) or cloud_overlays(cloud) for key, (_, cloud) in found.items()}
@@ -90,8 +92,10 @@ def _errors(bakes: Mapping[str, BakedTransfer]) -> tuple[dict[str, FalseColours]
 def _vectors(bakes: Mapping[str, BakedTransfer]) -> tuple[dict[str, FalseColours], Legend]:
     counts = {name: used_vectors(baked.bases) for name, baked in bakes.items()}
     most = max(1, max(int(count.max(initial=0)) for count in counts.values()))
-    colours = {name: FalseColours(heat_colours(counts[name][baked.cluster] / most)) for name, baked in bakes.items()}
-    return colours, Legend("Vectors of each cluster", _bar(), ("0", str(most)))
+    # Many clusters have them all: neither white nor black, which would hide their shape.
+    colours = {name: FalseColours(heat_colours(LEAST + (MOST - LEAST) * counts[name][baked.cluster] / most))
+               for name, baked in bakes.items()}
+    return colours, Legend("Vectors of each cluster", _bar(LEAST, MOST), ("0", str(most)))
 
 
 MAKERS = {CLUSTERS: _clusters, ERROR: _errors, VECTORS: _vectors}
@@ -101,9 +105,9 @@ def _unknown(baked: BakedTransfer) -> FalseColours:
     return FalseColours(np.tile(np.array(UNKNOWN, np.float32), (len(baked.cluster), 1)))
 
 
-def _bar() -> tuple[tuple[float, float, float], ...]:
-    """The colours of heat as the display shows them."""
-    return tuple(map(tuple, to_display(heat_colours(np.linspace(0.0, 1.0, LEGEND_STEPS))).tolist()))
+def _bar(low: float = 0.0, high: float = 1.0) -> tuple[tuple[float, float, float], ...]:
+    """The colours of heat from low to high as the display shows them."""
+    return tuple(map(tuple, to_display(heat_colours(np.linspace(low, high, LEGEND_STEPS))).tolist()))
 
 
 def nice_end(value: float) -> float:
@@ -165,7 +169,7 @@ def _lights(cloud: LightCloud) -> tuple[Overlay, ...]:
         edges = [(k, k | 1 << axis) for k in range(8) for axis in range(3) if not k >> axis & 1]
         marks = [Overlay("LINES", corners[np.ravel(edges)], np.tile(np.float32(BOX), (24, 1))),
                  Overlay("POINTS", cloud.dense.astype(np.float32), np.tile(np.float32(DENSE), (len(cloud.dense), 1)),
-                         3.0, in_front=True), *marks]
+                         4.0, in_front=True), *marks]
     return tuple(marks)
 
 

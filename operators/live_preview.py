@@ -173,7 +173,7 @@ def draw_list() -> list[DrawItem]:
     if _live.signature is None:
         return []
     space, exposure = bpy.context.space_data, 2.0 ** bpy.context.scene.prt.exposure
-    colours = _live.display.colours_of(bpy.context.scene.prt.display, _keyed())
+    colours = _live.display.colours_of(bpy.context.scene.prt.display, _bakes())
     items, present = [], 0
     for found in bpy.context.view_layer.objects:
         shown = _live.shown.get(found.name_full)
@@ -218,11 +218,11 @@ def labels() -> list[tuple[str, tuple[float, ...]]]:
 def marks() -> Marks:
     """What is marked in the scene: lights of the cloud or patches of lit surfaces; and the legend of false colours."""
     moves = {name: shown.moved for name, shown in _live.shown.items()}
-    return _live.display.marks(_keyed(), moves, bpy.context.scene.prt.show_cloud)
+    return _live.display.marks(_bakes(), moves, bpy.context.scene.prt.show_cloud)
 
 
-def _keyed() -> dict[str, tuple[Hashable, BakedTransfer]]:
-    return {name: (shown.key, shown.baked) for name, shown in _live.shown.items()}
+def _bakes() -> dict[str, BakedTransfer]:
+    return {name: shown.baked for name, shown in _live.shown.items()}
 
 
 def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -19,7 +19,8 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
     sys.modules["prt"].__path__ = [str(ROOT)]
 
 # Of the preview alone, or turned into a field of another name.
-NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection"}
+NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection", "display",
+             "show_cloud"}
 
 
 @pytest.fixture

@@ -52,7 +52,7 @@ def main(path: str) -> None:
     scene = bpy.context.scene
     bpy.ops.mesh.primitive_plane_add(size=4.0)
     named("Floor", material("Tiles", (1, 1, 1), checker("tiles", (0.85, 0.8, 0.7), (0.15, 0.2, 0.35))))
-    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.6, location=(0.9, -0.5, 0.6), segments=48, ring_count=24)
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.6, location=(0.9, -0.5, 0.6), segments=32, ring_count=16)
     bpy.ops.object.shade_smooth()
     named("Ball", material("Ball", (1, 1, 1), checker("ball", (0.9, 0.35, 0.1), (0.9, 0.9, 0.85))))
     bpy.ops.mesh.primitive_monkey_add(size=1.3, location=(-0.7, 0.0, 0.8), rotation=(-0.5, 0.0, 0.3))
