@@ -22,7 +22,7 @@ from ..gpu_shaders import viewport
 from ..gpu_shaders.overlay import Marks
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.image_albedo import surface_textures
+from ..prt_addon.blender.image_albedo import surface_textures, textures_key
 from ..prt_addon.blender.lights import light_coefficients
 from ..prt_addon.blender.stored import baked_mesh, baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
@@ -61,6 +61,7 @@ class Shown:
     direct: NDArray[np.float32] | None = None
     moved: NDArray[np.float64] | None = None
     textures: SurfaceTextures | None = None
+    textures_key: Hashable = None
 
 
 @dataclass
@@ -336,7 +337,9 @@ def _read_stale() -> None:
         except PRTError as error:
             line.stale = str(error)
         shown.stale = bool(line.stale)
-        shown.textures = surface_textures(found, shown.baked, depsgraph)
+        key = textures_key(found, depsgraph)
+        if key != shown.textures_key:
+            shown.textures_key, shown.textures = key, surface_textures(found, shown.baked, depsgraph)
         shown.moved = None if shown.stale else transform_since_bake(found, shown.baked.header)
         changed |= before[0] != shown.stale or not np.array_equal(before[1], shown.moved)
     if changed and any(shown.baked.cloud is not None for shown in _live.shown.values()):

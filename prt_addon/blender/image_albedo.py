@@ -8,6 +8,7 @@ albedo of its receivers, which `materials` evaluates.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import bpy
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from ..scene.surface_textures import SurfaceTextures, TextureUse, places_on_parts
 from ..storage.container import BakedTransfer
 from ..storage.digests import digest_arrays
+from .fingerprint import geometry_digest
 from .nodes import Groups, constant_of, origin_of
 from .read_scene import is_flattened, transform_rows
 
@@ -170,9 +172,15 @@ def surface_textures(scene_object: bpy.types.Object, baked: BakedTransfer, depsg
         return None
     matrix = np.array(baked.header["matrix"], np.float64).reshape(4, 4)
     inverse = np.linalg.inv(matrix)  # small
-    local = transform_rows(baked.positions[baked.triangles], inverse[:3, :3]) + inverse[:3, 3]
-    found = places_on_parts(local, baked.source, corners, places)
+    local = transform_rows(baked.positions, inverse[:3, :3]) + inverse[:3, 3]
+    found = places_on_parts(local[baked.triangles], baked.source, corners, places)
     return SurfaceTextures(uses, use, found, (uses, digest_arrays(use, found)))
+
+
+def textures_key(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Hashable:
+    """Changes when `surface_textures` of the same bake may; None where it finds none. Costs a digest of the mesh."""
+    textures = tuple(texture_of(slot.material) for slot in scene_object.material_slots)
+    return (textures, geometry_digest(scene_object, depsgraph)) if any(textures) else None
 
 
 _Part = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], tuple[TextureUse, ...]]

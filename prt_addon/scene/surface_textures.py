@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+ROUNDING = 4e-7  # of single precision, in which bakes hold positions, relative to the largest
+
 
 @dataclass(frozen=True)
 class TextureUse:
@@ -68,5 +70,8 @@ def places_on_parts(points: NDArray[np.floating], source: NDArray[np.int32], sou
 
     source: (t,) into source_corners (s, 3, 3), in the same space as points, and source_places (s, 3, 2).
     """
-    shares = shares_of_corners(points, source_corners[source])
+    own = source_corners[source]
+    if float(np.abs(points - own).max(initial=0.0)) <= ROUNDING * float(np.abs(own).max(initial=0.0)):
+        return source_places[source].astype(np.float32)  # whole triangles, their corners in order
+    shares = shares_of_corners(points, own)
     return np.sum(shares[..., None] * source_places[source][:, None], axis=2).astype(np.float32)
