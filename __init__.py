@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import bpy
 
-from .operators import commands, live_preview, properties
+from .operators import commands, interrupted, live_preview, properties
 from .operators.analyze import PRT_OT_analyze
-from .operators.bake import PRT_OT_bake, PRT_OT_cancel
+from .operators.bake import PRT_OT_bake, PRT_OT_cancel, PRT_OT_cancel_all, PRT_OT_follow_bakes
 from .operators.clear import PRT_OT_clear
+from .operators.interrupted import PRT_OT_discard_interrupted, PRT_OT_resume
 from .operators.job_mixin import JobMixin
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
@@ -26,6 +27,10 @@ CLASSES = (
     PRT_OT_analyze,
     PRT_OT_bake,
     PRT_OT_cancel,
+    PRT_OT_cancel_all,
+    PRT_OT_follow_bakes,
+    PRT_OT_resume,
+    PRT_OT_discard_interrupted,
     PRT_OT_clear,
     PRT_OT_toggle_preview,
     PRT_OT_relight,
@@ -48,6 +53,7 @@ def register() -> None:
         bpy.utils.register_class(cls)
     properties.register()
     live_preview.register()
+    interrupted.register()
     commands.register()
 
 
@@ -55,6 +61,7 @@ def unregister() -> None:
     """Called by Blender when the extension is disabled: nothing stays behind."""
     JobMixin.stop_now()
     commands.unregister()
+    interrupted.unregister()
     live_preview.unregister()
     properties.unregister()
     for cls in reversed(CLASSES):

@@ -11,6 +11,7 @@ Reading order is data order:
     draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
                      when the data's signature changes, relit when the light's changes, else only drawn.
     overlay.py       marks over the picture: points, lines, triangles, and the legend of false colours
+    occluders.py     depth of surfaces that are not ours, where Blender leaves none.
     viewport.py      the draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
     offscreen.py     `draw_camera` for background mode and the bpy wheel, `write_png`.
 
@@ -18,6 +19,7 @@ The GLSL:
 
     texel_layout.glsl          where value i of a long list lies in a 2D texture (prepended to readers of one)
     exit_radiance.comp.glsl    once per light change: exit radiance of every point and row, into a texture
+    depth.vert/frag.glsl       surfaces that only hide others
     surface.vert.glsl          once per frame: fetches a point's exit radiance by gl_VertexID
     albedo.glsl                a fragment's albedo: from the image of its material, else interpolated
     surface.frag.glsl          multiplies the interpolated radiance by it

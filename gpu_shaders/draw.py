@@ -15,7 +15,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
-from ..prt_addon.relighting.exit_radiance import cluster_constants
+from ..prt_addon.relighting.exit_radiance import baked_constants
 from ..prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
 from . import image_textures, programs
 from .image_textures import TexturedVertices, textured_vertices
@@ -240,7 +240,7 @@ class DrawingCache:
         if self._lights.get(item.key) != light:
             if item.is_lit:
                 coefficients = matching_light(item.light, drawing.data.columns)
-                drawing.relight(cluster_constants(item.baked.bases, coefficients, item.baked.cluster_zone))
+                drawing.relight(baked_constants(item.baked, coefficients))
             else:
                 drawing.show_colours(heat_colours(item.heat) if item.colours is None else item.colours.values)
             self._lights[item.key] = light

@@ -65,6 +65,18 @@ def surface(textured: bool = False) -> gpu.types.GPUShader:
     return gpu.shader.create_from_info(info)
 
 
+@functools.cache
+def depth_alone() -> gpu.types.GPUShader:
+    """The program that writes the depth of other surfaces: see depth.vert.glsl."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC3", "position")
+    info.fragment_out(0, "VEC4", "fragment_colour")
+    info.push_constant("MAT4", "transform")
+    info.vertex_source(_source("depth.vert.glsl"))
+    info.fragment_source(_source("depth.frag.glsl"))
+    return gpu.shader.create_from_info(info)
+
+
 def _add_albedo(info: gpu.types.GPUShaderCreateInfo, varyings: gpu.types.GPUStageInterfaceInfo, textured: bool,
                 slot: int) -> None:
     """Declare where albedo.glsl takes its colour from: the vertices, by an attribute in a slot, or an image."""
@@ -130,4 +142,5 @@ def release() -> None:
     """Free all programs; the next use compiles them again."""
     exit_radiance.cache_clear()
     surface.cache_clear()
+    depth_alone.cache_clear()
     view_surface.cache_clear()

@@ -27,16 +27,19 @@ import gpu
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Vector
+from numpy.typing import NDArray
 
 from ..prt_addon.errors import PRTError
 from . import programs
 from .draw import DrawingCache
+from .occluders import Occluder, OccluderCache
 from .overlay import NOTHING, Marks, OverlayCache, draw_legend
 from .render_data import DrawItem
 
 SPACE = bpy.types.SpaceView3D
 GetDrawList = Callable[[], Sequence[DrawItem]]
 IsComplete = Callable[[], bool]
+GetOccluders = Callable[[], Sequence[Occluder]]
 
 
 GetLabels = Callable[[], Sequence[tuple[str, Sequence[float]]]]
@@ -46,6 +49,10 @@ LABEL_SIZE, LABEL_OFFSET = 12, (14, 10)  # in units of the interface's scale
 
 def _never_complete() -> bool:
     return False
+
+
+def _no_occluders() -> Sequence[Occluder]:
+    return ()
 
 
 def _no_marks() -> Marks:
@@ -77,7 +84,9 @@ class _Viewport:
     get_draw_list: GetDrawList
     is_complete: IsComplete
     get_labels: GetLabels = _no_labels
+    get_occluders: GetOccluders = _no_occluders
     get_marks: GetMarks = _no_marks
+    occluders: OccluderCache = field(default_factory=OccluderCache)
     handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
     overlays: OverlayCache = field(default_factory=OverlayCache)
@@ -90,21 +99,24 @@ _active: _Viewport | None = None
 
 
 def enable(get_draw_list: GetDrawList, is_complete: IsComplete = _never_complete,
-           get_labels: GetLabels = _no_labels, get_marks: GetMarks = _no_marks) -> None:
+           get_labels: GetLabels = _no_labels, get_occluders: GetOccluders = _no_occluders,
+           get_marks: GetMarks = _no_marks) -> None:
     """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the callables change.
 
     get_draw_list runs on every redraw of every region, with bpy.context of that region: it must be cheap, and may
     raise PRTError, which `status()` then shows. is_complete runs after it and says whether the listed objects are the
     only visible surfaces of the region; then they hide each other by their own depth alone. get_labels runs on every
     redraw, too: short texts and the places in the world (3,) beside which they stand while overlays are shown; and so
-    does get_marks: what is marked in the scene then, and the legend.
+    does get_marks: what is marked in the scene then, and the legend. get_occluders is asked where Blender leaves no
+    depth: for what else is visible in the region and can be in front.
     """
     global _active
     if _active is not None:
         _active.get_draw_list, _active.is_complete = get_draw_list, is_complete
-        _active.get_labels, _active.get_marks = get_labels, get_marks
+        _active.get_labels, _active.get_occluders = get_labels, get_occluders
+        _active.get_marks = get_marks
     else:
-        _active = _Viewport(get_draw_list, is_complete, get_labels, get_marks)
+        _active = _Viewport(get_draw_list, is_complete, get_labels, get_occluders, get_marks)
         for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW"),
                                (_draw_labels, "POST_PIXEL")):
             _active.handlers.append(SPACE.draw_handler_add(handler, (), "WINDOW", phase))
@@ -120,6 +132,7 @@ def disable() -> None:
         SPACE.draw_handler_remove(handle, "WINDOW")
     _active.cache.clear()
     _active.overlays.clear()
+    _active.occluders.clear()
     _active = None
     programs.release()
     redraw()
@@ -215,11 +228,9 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
     if not items:
         return
     view_projection = np.array(bpy.context.region_data.perspective_matrix, np.float64)
-    clear = viewport.is_complete() or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine)
     if not all(item.is_lit for item in items):  # false colours: the overlays' buffer gets no view transform
         viewport.status.colour_managed, viewport.status.fallback = True, ""
-        if clear:
-            gpu.state.active_framebuffer_get().clear(depth=1.0)
+        _prepare_depth(viewport, gpu.state.active_framebuffer_get(), view_projection)
         viewport.cache.draw(items, view_projection)
         return
     reason = _why_not_usable(framebuffer, bpy.context.region)
@@ -228,9 +239,18 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
         viewport.cache.draw(items, view_projection)
         return
     with framebuffer.bind():
-        if clear:
-            framebuffer.clear(depth=1.0)
+        _prepare_depth(viewport, framebuffer, view_projection)
         viewport.cache.draw(items, view_projection)
+
+
+def _prepare_depth(viewport: _Viewport, framebuffer: gpu.types.GPUFrameBuffer,
+                   view_projection: NDArray[np.float64]) -> None:
+    """Clear the bound framebuffer's depth where it is not the scene's or not needed, and draw what it lacks."""
+    complete = viewport.is_complete()
+    if complete or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
+        framebuffer.clear(depth=1.0)
+        if not complete:
+            viewport.occluders.draw(viewport.get_occluders(), view_projection)
 
 
 def _why_not_usable(framebuffer: gpu.types.GPUFrameBuffer | None, region: bpy.types.Region) -> str:
@@ -253,7 +273,7 @@ def _sees_through(shading: bpy.types.View3DShading) -> bool:
 
 
 def _depth_is_missing(space: bpy.types.SpaceView3D, engine: str) -> bool:
-    """Whether the picture's depth is not the scene's. Other objects then can't hide the baked ones.
+    """Whether the picture's depth is not the scene's, so that others have to be drawn into it.
 
     Workbench always writes it, other engines only for the overlays: without them EEVEE leaves 0 everywhere, so that
     nothing would pass, and Cycles 1.

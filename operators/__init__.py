@@ -3,8 +3,11 @@
 
     properties.py      what the user sets (Scene.prt) and what panels show of this session (WindowManager.prt)
     bake_session.py    one bake from a scene to stored data, around the child process: for the operator and the command
-    job_mixin.py       the one place that knows modal timers, Esc, status text and progress
-    bake.py            prt.bake, prt.cancel        clear.py    prt.clear        analyze.py    prt.analyze
+    bake_request.py    what was asked for, until its turn comes; place.py: its scene and view layer
+    job_mixin.py       the queue, and the one place that knows modal timers, Esc, status text and progress
+    interrupted.py     prt.resume, prt.discard_interrupted: bakes that a crash or a load ended
+    bake.py            prt.bake, prt.cancel, prt.cancel_all
+    clear.py           prt.clear                   analyze.py  prt.analyze
     preview.py         prt.toggle_preview          relight.py  prt.relight
     scene_lamps.py     lamps on bakes, step by step; relit.py: a scene's bakes under its light, all at once
     live_preview.py    what the viewport draws, and the handlers that make it follow the scene and its light

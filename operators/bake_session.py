@@ -7,10 +7,11 @@ is complete. Whatever ends a bake earlier leaves previous bakes as they are and 
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +20,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
+from ..prt_addon.baking.claims import Claim, discard_if_free
 from ..prt_addon.baking.local_lights import fit_to_lamps
 from ..prt_addon.baking.memory import memory_warning
 from ..prt_addon.baking.plan import make_plan
-from ..prt_addon.baking.process import BakeProcess
+from ..prt_addon.baking.process import BakeProcess, CompletedBake
 from ..prt_addon.baking.recipe import BakeResult, transport_settings
+from ..prt_addon.baking.record import JobRecord, note_end, read_record, write_record
 from ..prt_addon.baking.settings import BakeSettings
 from ..prt_addon.blender.fingerprint import fingerprint, surroundings
 from ..prt_addon.blender.light_region import light_regions
 from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
-from ..prt_addon.blender.read_scene import read_objects
-from ..prt_addon.blender.stored import write_baked
+from ..prt_addon.blender.read_scene import read_objects, selected_names
+from ..prt_addon.blender.stored import stale, write_baked
 from ..prt_addon.blender.visibility import find_objects, render_visible_objects
 from ..prt_addon.errors import BadScene, StorageError
 from ..prt_addon.lighting.light_cloud import free_space
 from ..prt_addon.reporting.headline import PARTS, headline
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
+from .place import Place
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 KEPT_DAYS = 14
@@ -68,12 +72,14 @@ def chosen_targets(scene: bpy.types.Scene) -> list[str] | None:
     return names
 
 
-def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> SceneMesh:
-    """The scene as it is traced, with what was left out among its warnings. targets: as `read_objects` takes them."""
+def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None,
+               selected: Sequence[str] | None = None) -> SceneMesh:
+    """The scene as it is traced, with what was left out among its warnings. targets, selected: as `read_objects` takes
+    them."""
     warnings: list[str] = []
     lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
     centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
-    mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings), settings.spacing,
+    mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings, selected), settings.spacing,
                               np.concatenate([lamps, centres]) if settings.local_light else None)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
@@ -120,26 +126,33 @@ def analysis_lines(analysis: dict[str, Any]) -> list[str]:
 
 @dataclass
 class BakeSession:
-    """A bake under way. Poll `process` until it is finished, then `store` and `discard`.
+    """A bake under way. Poll `process` until it is finished, then `store` and `discard`; at last `close`, in any case.
 
-    digests: per target by name, and surroundings: of everything, as they were when the scene was read.
+    digests: per target by name, and surroundings: of everything, as they were when the scene was read. identities:
+    session_uid of every object by the name that it had then, so that a renamed one is found. notes: what else to tell.
     """
 
-    job: Path
-    process: BakeProcess
+    claim: Claim
+    process: BakeProcess | CompletedBake
     started: float
-    scene_name: str
+    scene: Place
     digests: dict[str, dict[str, str | None]]
     surroundings: dict[str, str]
+    identities: dict[str, int]
+    notes: list[str] = field(default_factory=list)
 
     @staticmethod
-    def start(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None) -> BakeSession:
-        """Read the scene and start its bake in a child process. targets: None for the selected meshes, or all.
+    def start(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None,
+              selected: Sequence[str] | None = None) -> BakeSession:
+        """Read the scene and start its bake in a child process. targets: None for the selected meshes, or all;
+        selected: counts in place of those selected now (`read_objects`).
 
         Raises PRTError.
         """
-        started = time.monotonic()
-        scene = read_scene(depsgraph, settings, targets)
+        started, asked = time.monotonic(), settings
+        if selected is None:
+            selected = selected_names(depsgraph.view_layer)
+        scene = read_scene(depsgraph, settings, targets, selected)
         settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
         scene = replace(scene, warnings=(*scene.warnings, *left_out))
         names = [o.name for o in scene.objects if o.is_target]
@@ -150,10 +163,37 @@ class BakeSession:
         folder = jobs_folder()
         _drop_forgotten(folder)
         regions = _regions(depsgraph, settings, scene) if settings.local_light else None
-        job = jobs.write_job(folder, scene, settings, reference_light(depsgraph), geometry, regions)
-        process = BakeProcess([sys.executable, *bpy.app.python_args], job)
-        process.start()
-        return BakeSession(job, process, started, depsgraph.scene.name, digests, surroundings(depsgraph))
+        around, place = surroundings(depsgraph), Place.of(depsgraph)
+        claim = jobs.claim_job(folder, scene, settings, reference_light(depsgraph), geometry, regions)
+        try:
+            write_record(claim.folder, JobRecord(
+                bpy.data.filepath, place.scene, place.view_layer, tuple(names), _tuple(targets), tuple(selected),
+                asked.as_dict(), digests, around, os.getpid(), time.time()))
+            process = BakeProcess([sys.executable, *bpy.app.python_args], claim.folder)
+            process.start()
+        except BaseException:
+            claim.release()
+            raise
+        return BakeSession(claim, process, started, place, digests, around, _identities(depsgraph.scene))
+
+    @staticmethod
+    def of_complete(folder: Path, record: JobRecord, depsgraph: bpy.types.Depsgraph) -> BakeSession | None:
+        """An interrupted bake whose result is there, if the scene is as it was when it was read; else None."""
+        found = {o.name_full: o for o in depsgraph.scene.objects}
+        if not jobs.job_summary(folder)["complete"] or surroundings(depsgraph) != record.surroundings or any(
+                name not in found or fingerprint(found[name], depsgraph) != digest
+                for name, digest in record.digests.items()):
+            return None
+        claim = Claim.take(folder)
+        if claim is None:
+            return None
+        return BakeSession(claim, CompletedBake(), time.monotonic(), Place.of(depsgraph), record.digests,
+                           record.surroundings, _identities(depsgraph.scene))
+
+    @property
+    def job(self) -> Path:
+        """Its job folder."""
+        return self.claim.folder
 
     @property
     def seconds(self) -> float:
@@ -163,21 +203,70 @@ class BakeSession:
     def store(self) -> BakeResult:
         """Put the child's complete result into the file's data. Raises PRTError.
 
-        Call it after the "done" message. Every object is looked up before the first is written, so that either all
-        are replaced or none. The job folder stays, so that nothing is lost if the file can't be saved.
+        Call it after the "done" message. Every object is looked up before the first is written, so that nothing is
+        written where all are gone; what was deleted meanwhile is told in `notes`. The job folder stays, so that nothing
+        is lost if the file can't be saved.
         """
         result = jobs.read_result(self.job)
-        scene = bpy.data.scenes.get(self.scene_name)
-        if scene is None:
-            raise BadScene(self.scene_name, "the scene was removed or renamed while its bake ran", "Undo that")
-        names = list(result.objects)
-        for scene_object, name in zip(find_objects(names, scene), names, strict=True):
-            write_baked(scene_object, result.objects[name], self.digests[name], self.surroundings)
-        return result
+        found = self.targets()
+        gone = [name for name, target in found.items() if target is None]
+        if len(gone) == len(found):
+            raise BadScene(", ".join(gone), "deleted while its bake ran, so nothing was stored",
+                           "Undo that and bake again: the finished bake is taken up at once")
+        for name, target in found.items():
+            if target is not None:
+                write_baked(target, result.objects[name], self.digests[name], self.surroundings)
+        self.notes += [f"{name} was deleted meanwhile, and its bake dropped" for name in gone]
+        return replace(result, objects={name: baked for name, baked in result.objects.items() if name not in gone})
+
+    def targets(self) -> dict[str, bpy.types.Object | None]:
+        """The targets as they are in the scene now, by the names that they had. Raises BadScene without the scene."""
+        present = {o.session_uid: o for o in self.scene.find().objects}
+        return {name: present.get(self.identities[name]) for name in self.digests}
+
+    def note_changes(self) -> None:
+        """Have `notes` tell which of the stored bakes is stale already, because the artist went on editing."""
+        depsgraph = self.scene.depsgraph()
+        around = surroundings(depsgraph)
+        for target in filter(None, self.targets().values()):
+            why = stale(target, depsgraph, around)
+            if why:
+                self.notes.append(f"{target.name} is stale already: {why.replace('since the bake', 'meanwhile')}. "
+                                  "Bake it again")
+
+    def object_in_use(self) -> str | None:
+        """A target that can't be written now, because it is in edit mode or being sculpted or painted."""
+        return next((target.name for target in self.targets().values()
+                     if target is not None and target.mode != "OBJECT"), None)
 
     def discard(self) -> None:
         """Drop the job folder."""
-        jobs.discard(self.job)
+        jobs.discard(self.claim)
+
+    def close(self) -> None:
+        """End the child if it lives, and let others have the job folder. May be called twice."""
+        self.process.cancel()
+        self.claim.release()
+
+    def end(self, state: str) -> None:
+        """`close` a bake that was cancelled or failed: nobody shall be asked whether it is to go on."""
+        self.process.cancel()
+        note_end(self.job, state)
+        self.claim.release()
+
+    def file_saved(self) -> None:
+        """The file has another name now: an interrupted bake belongs to that one."""
+        record = read_record(self.job)
+        if record is not None:
+            write_record(self.job, replace(record, file=bpy.data.filepath))
+
+
+def _identities(scene: bpy.types.Scene) -> dict[str, int]:
+    return {o.name_full: o.session_uid for o in scene.objects}
+
+
+def _tuple(names: Sequence[str] | None) -> tuple[str, ...] | None:
+    return None if names is None else tuple(names)
 
 
 def _regions(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, scene: SceneMesh) -> NDArray[np.float64]:
@@ -199,8 +288,12 @@ def _check_storable(targets: list[bpy.types.Object]) -> None:
 def _drop_forgotten(folder: Path) -> None:
     """Remove jobs that nobody resumed: an interrupted bake of a scene since edited would lie there for ever."""
     for job in folder.glob("bake-*"):
-        if time.time() - job.stat().st_mtime > KEPT_DAYS * 86400:
-            jobs.discard(job)
+        try:
+            age = time.time() - job.stat().st_mtime
+        except OSError:  # another Blender has just removed it
+            continue
+        if age > KEPT_DAYS * 86400:
+            discard_if_free(job)
 
 
 def baked_message(result: BakeResult, seconds: float) -> str:

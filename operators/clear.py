@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.blender.stored import baked_objects, clear_baked
+from ..prt_addon.blender.stored import baked_objects, clear_baked, clear_orphans
 from ..prt_addon.errors import PRTError
 from . import live_preview
 from .properties import assign, session
@@ -35,6 +35,8 @@ class PRT_OT_clear(bpy.types.Operator):
             chosen = [o for o in baked if o.select_get()] or baked
             for baked_object in chosen:
                 clear_baked(baked_object)
+            if chosen is baked:
+                clear_orphans(context.scene)
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import bpy
@@ -19,11 +20,13 @@ from bpy.app.handlers import persistent
 from numpy.typing import NDArray
 
 from ..gpu_shaders import viewport
+from ..gpu_shaders.occluders import Occluder
 from ..gpu_shaders.overlay import Marks
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.image_albedo import surface_textures, textures_key
 from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.read_scene import read_object_triangles, read_triangles
 from ..prt_addon.blender.stored import baked_mesh, baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import PRTError
 from ..prt_addon.lighting.local_lights import LocalLight
@@ -89,6 +92,8 @@ class Live:
     shown: dict[str, Shown] = field(default_factory=dict)
     lines: list[Line] = field(default_factory=list)
     known: Hashable = None
+    geometry: int = 0  # counts changes of shapes
+    around: dict[str, str] = field(default_factory=dict)
     message: str = ""
     light: NDArray[np.float64] | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
@@ -149,7 +154,7 @@ def enable() -> None:
     """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
     _read_bakes()
     _read_light()
-    viewport.enable(draw_list, shows_everything, labels, marks)
+    viewport.enable(draw_list, shows_everything, labels, occluders, marks)
     assign(session(), preview=True)
     _tell_panel()
 
@@ -210,6 +215,24 @@ def shows_everything() -> bool:
     return True
 
 
+def occluders() -> list[Occluder]:
+    """All meshes that this region shows and we do not draw: they may stand in front of those that we draw."""
+    space, depsgraph = bpy.context.space_data, bpy.context.view_layer.depsgraph
+    found, lit = [], {name for name in _live.shown if (known := bpy.context.view_layer.objects.get(name)) is not None
+                      and _is_drawn(known, space)}
+    for instance in depsgraph.object_instances if depsgraph is not None else ():
+        source = instance.object
+        owner = (instance.parent if instance.is_instance else source).original
+        if owner.name_full in lit or not isinstance(source.data, bpy.types.Mesh) or not instance.show_self or (
+                owner.display_type in OUTLINES or not owner.visible_in_viewport_get(space)):
+            continue
+        key = source.data.as_pointer(), _live.geometry
+        # An instance's object is gone after this round; its mesh stays.
+        read = partial(read_triangles, source.data) if instance.is_instance else partial(read_object_triangles, source)
+        found.append(Occluder(key, np.array(instance.matrix_world), read))
+    return found
+
+
 def labels() -> list[tuple[str, tuple[float, ...]]]:
     """What is written beside lamps: those outside of the cloud."""
     outside = _live.lamps.outside if _live.shown else set()
@@ -246,6 +269,7 @@ def _known_bakes() -> Hashable:
 def _read_bakes() -> None:
     """Read all baked objects of the scene; what can't be read is not shown, and the panel says why."""
     _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known_bakes()
+    _live.lamps.forget_geometry()
     layer = {found.name_full for found in bpy.context.view_layer.objects}
     for found in baked_objects(bpy.context.scene):
         line = Line(found.name_full)
@@ -321,10 +345,12 @@ def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
 def _read_stale() -> None:
     """Compare the baked objects with what they were baked from."""
     _live.stale_dirty = False
-    _live.lamps.forget_geometry()
     started = time.perf_counter()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
+    if around != _live.around:
+        _live.around = around
+        _live.lamps.forget_geometry()
     objects = {found.name_full: found for found in bpy.context.scene.objects}
     changed = False
     for line in _live.lines:
@@ -487,9 +513,10 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 
 def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     """Note what a depsgraph's updates may have changed. light: whether that has changed for certain."""
-    geometry, asked = False, light
+    geometry, asked, reshaped = False, light, False
     for update in depsgraph.updates:
         changed = update.id
+        reshaped |= update.is_updated_geometry
         asked |= isinstance(changed, LISTED_TYPES)
         if isinstance(changed, LIGHT_TYPES):
             light = True
@@ -501,6 +528,7 @@ def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     now = time.perf_counter()
     for live in _lives.values():
         live.light_dirty |= light
+        live.geometry += reshaped
         if geometry and not live.stale_dirty:
             live.stale_dirty, live.stale_due = True, now + max(STALE_WAIT, 4.0 * live.stale_seconds)
     if light and session().preview:
@@ -520,6 +548,7 @@ def _on_data_replaced(*_arguments: object) -> None:
     """Undo replaced all data."""
     for live in _lives.values():
         live.signature = None
+        live.geometry += 1
     bakes_changed()
 
 

@@ -338,6 +338,10 @@ class PRTSession(bpy.types.PropertyGroup):
     """What panels show of this session: WindowManager.prt. Written by operators and handlers, never by panels."""
 
     running: BoolProperty()
+    title: StringProperty()
+    waiting: StringProperty()
+    ended: StringProperty()
+    interrupted: StringProperty()
     stage: StringProperty()
     fraction: FloatProperty()
     seconds_left: FloatProperty(default=-1.0)

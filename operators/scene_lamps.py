@@ -49,6 +49,7 @@ class SceneLamps:
     _clouds: dict[tuple[str, bytes], LampLight | SurfaceLamps] = field(default_factory=dict)
     _lit: dict[tuple[str, bytes], CloudLight] = field(default_factory=dict)
     _direct: dict[tuple[str, bytes], DirectLight] = field(default_factory=dict)
+    _keys: dict[int, tuple[LocalBasis, str]] = field(default_factory=dict)  # by the cloud's identity
 
     def forget_geometry(self) -> None:
         """Something moved or changed its shape: shadows are to be found anew."""
@@ -56,6 +57,7 @@ class SceneLamps:
         self._tracers.clear()
         self._clouds.clear()
         self._direct.clear()
+        self._keys.clear()
 
     def step(self, baked: dict[str, BakedTransfer], depsgraph: bpy.types.Depsgraph,
              warnings: list[str], seconds: float = AT_ONCE, moves: Moves | None = None) -> list[LocalLight]:
@@ -80,7 +82,7 @@ class SceneLamps:
         self._lit = {}
         for name, transfer in near.items():
             moved = (moves or {}).get(name)
-            key = cloud_key(transfer), _move_key(moved)
+            key = self._cloud_key(transfer), _move_key(moved)
             if key in self._lit:
                 continue
             if key not in self._clouds:
@@ -103,7 +105,7 @@ class SceneLamps:
     def cloud_light(self, baked: BakedTransfer, moved: Move = None) -> NDArray[np.float32] | None:
         """The lamps' light (zones, columns, 3) in the cloud of a bake, moved since as `step` was told; None without a
         cloud, and where `step` has not heard of it."""
-        found = self._lit.get((cloud_key(baked), _move_key(moved))) if baked.cloud is not None else None
+        found = self._lit.get((self._cloud_key(baked), _move_key(moved))) if baked.cloud is not None else None
         return None if found is None else found.values
 
     def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
@@ -120,6 +122,13 @@ class SceneLamps:
             self._direct[key] = DirectLight(self._traced(moved), baked)
         samples = [QUICK_SAMPLES if lamp.key in moving else SHADOW_SAMPLES for lamp in lamps]
         return self._direct[key].of(_as_seen(lamps, moved), samples)
+
+    def _cloud_key(self, baked: BakedTransfer) -> str:
+        """`cloud_key`, computed once: redraws ask for it."""
+        held = self._keys.get(id(baked.cloud))
+        if held is None or held[0] is not baked.cloud:
+            held = self._keys[id(baked.cloud)] = baked.cloud, cloud_key(baked)
+        return held[1]
 
     def _traced(self, moved: Move) -> Tracer:
         """Of everything that casts shadows, where the bake saw it."""

@@ -53,13 +53,13 @@ def bake(arguments: argparse.Namespace) -> Iterator[str]:
     session = BakeSession.start(bpy.context.evaluated_depsgraph_get(), settings, arguments.objects)
     try:
         _follow(session)
+        result = session.store()
+        save_blend(arguments.output)
+        if arguments.report is not None:
+            write_report(arguments.report, result.report)
+        session.discard()  # only now: until the file is saved, the finished stages are all there is
     finally:
-        session.process.cancel()
-    result = session.store()
-    save_blend(arguments.output)
-    if arguments.report is not None:
-        write_report(arguments.report, result.report)
-    session.discard()  # only now: until the file is saved, the finished stages are all there is
+        session.close()
     _tell(headline(result.report))
     yield str(arguments.output)
     if arguments.report is not None:

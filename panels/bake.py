@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import bpy
 
+from .jobs import draw_interrupted, draw_jobs, draw_messages
 from .layout import Sidebar, plural, wrapped
 
 NAMES = 3  # of objects that are told
@@ -21,8 +22,8 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
         layout, settings, session = self.layout, context.scene.prt, context.window_manager.prt
         layout.use_property_split = True
         layout.use_property_decorate = False
+        draw_interrupted(layout, context)
         column = layout.column()
-        column.enabled = not session.running
         column.prop(settings, "targets")
         if settings.targets == "collection":
             column.prop(settings, "target_collection")
@@ -30,7 +31,6 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
         for line, icon in _what_is_baked(context):
             wrapped(told, context, line, icon)
         column = layout.column()
-        column.enabled = not session.running
         column.prop(settings, "preset")
         column.prop(settings, "lighting")
         for line in _light_warnings(context):
@@ -39,16 +39,11 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
         distant.active = settings.lighting != "local"  # columns of lamps know no order
         distant.prop(settings, "order")
         column.prop(settings, "bounces")
-        if session.running:
-            layout.label(text=session.stage)
-            layout.progress(factor=session.fraction, text=_progress(session))
-            layout.operator("prt.cancel", icon="CANCEL")
-        else:
-            row = layout.row(align=True)
-            row.operator("prt.bake", text="Bake", icon="RENDER_STILL")
-            row.operator("prt.analyze", icon="VIEWZOOM")
-        if session.message:
-            wrapped(layout, context, session.message, "ERROR" if session.failed else "INFO", session.failed)
+        row = layout.row(align=True)
+        row.operator("prt.bake", text="Bake Next" if session.running else "Bake", icon="RENDER_STILL")
+        row.operator("prt.analyze", icon="VIEWZOOM")
+        draw_jobs(layout, context)
+        draw_messages(layout, context)
         if session.analysis:
             box = layout.box()
             for number, line in enumerate(session.analysis.splitlines()):

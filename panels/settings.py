@@ -16,13 +16,11 @@ class _Expert(Sidebar):
     bl_parent_id = "PRT_PT_bake"
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
-    def column(self, context: bpy.types.Context) -> bpy.types.UILayout:
-        """A column for settings, greyed while a bake runs."""
+    def column(self, _context: bpy.types.Context) -> bpy.types.UILayout:
+        """A column for settings: of the next bake, while one runs."""
         self.layout.use_property_split = True
         self.layout.use_property_decorate = False
-        column = self.layout.column()
-        column.enabled = not context.window_manager.prt.running
-        return column
+        return self.layout.column()
 
 
 class PRT_PT_rays(_Expert, bpy.types.Panel):
@@ -109,7 +107,6 @@ class PRT_PT_compression(_Expert, bpy.types.Panel):
         coherent.active = settings.lighting == "environment"  # it would move receivers out of their zones
         coherent.prop(settings, "coherence")
         measured = self.layout.column(heading="Measure the Error at")
-        measured.enabled = column.enabled
         measured.prop(settings, "error_receivers")
         paths = measured.column()
         paths.active = settings.error_receivers > 0

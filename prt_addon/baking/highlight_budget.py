@@ -30,6 +30,7 @@ from ..basis.directions import disc_directions, tangent_frames
 from ..basis.hemisphere import Indices
 from ..basis.spherical_harmonics import evaluate, order_of
 from ..lighting.reference_light import ReferenceLight
+from ..lighting.windowing import for_highlights
 from ..linear_algebra import batched_multiply, multiply
 from ..transport.glossy import surface_frames
 from ..transport.path_reference import PATHS_AT_ONCE, DistantSuns
@@ -83,11 +84,12 @@ class Measured:
 
 
 def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: ReferenceLight, order: int, bounces: int,
-                     recorded: int, paths: int, seed: int) -> Generator[float, None, dict[str, Any]]:
+                     recorded: int, paths: int, seed: int, soft: bool = False,
+                     ) -> Generator[float, None, dict[str, Any]]:
     """Yield progress, return an entry (see `error_budget.summary`) of each step of the chain above.
 
     bounces: most bounces, -1 for all. recorded: at how many hits of a path the bake has true highlights (0 or 1).
-    paths: of each receiver.
+    paths: of each receiver. soft: whether highlights reflect a light that rings less.
     """
     tracer, scene = surfaces.tracer, surfaces.scene
     receivers = ReceiverSet.of_keys(scene, tracer, sample.keys)
@@ -95,12 +97,13 @@ def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: Ref
     frames = surface_frames(scene.normals[sample.keys], scene.tangents[sample.keys])
     generator = np.random.Generator(np.random.PCG64([seed, 79]))
     views = cosine_directions(lattice(len(sample.keys), VIEWS, generator)).reshape(-1, VIEWS, 3)
-    task = Measurement(surfaces, receivers, frames, views, light, order, bounces, (recorded, ALL_HITS), paths, seed)
+    task = Measurement(surfaces, receivers, frames, views, light, order, bounces, (recorded, ALL_HITS), paths, seed,
+                       soft)
     before = tracer.rays
     measured = yield from measure(task, scene.material[sample.keys])
     rays = tracer.rays - before
     shown = hemisphere.evaluate(sample.functions, views.reshape(-1, 3)).reshape(*views.shape[:2], -1)
-    coefficients = light.coefficients(order)
+    coefficients = task.reflected
     baked = _seen(shown, np.sum(sample.rows * coefficients[None, None], axis=2))
     drawn = _seen(shown, np.sum(sample.compressed * coefficients[None, None], axis=2))
     rows = np.stack([_seen(shown, _reflected(surfaces, scene.material[sample.keys], incident))
@@ -161,6 +164,13 @@ class Measurement:
     glossy_hits: tuple[int, int]
     paths: int
     seed: int
+    soft: bool = False
+
+    @property
+    def reflected(self) -> Array:
+        """The light at the bake's order as its highlights reflect it, (order^2, 3)."""
+        coefficients = self.light.coefficients(self.order)
+        return for_highlights(coefficients) if self.soft else coefficients
 
     @property
     def of_view(self) -> int:
@@ -207,7 +217,7 @@ def _trace(task: Measurement, number: int, members: NDArray[np.int64], incident_
     generator = np.random.Generator(np.random.PCG64(seed))
     highlight = task.surfaces.highlights[number]
     window = task.surfaces.plan.parts[number].window[:task.order ** 2]
-    coefficients = task.light.coefficients(task.order) * window[:, None]
+    coefficients = task.reflected * window[:, None]
 
     def emission(directions: Array) -> Array:
         banded = multiply(evaluate(task.order, directions), coefficients)

@@ -2,14 +2,14 @@
 """Job folders: a bake's input, its finished stages and its result, so that an interrupted bake resumes.
 
 The folder's name holds a digest of the scene and the settings: the same job finds its stages again, any other starts
-afresh.
+afresh. Where another living process bakes the same job, the folder has a number behind its digest.
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Generator
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_clo
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from .claims import Claim
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
@@ -38,7 +39,15 @@ _LAMP_ARRAYS = ("material", "kernels")  # of lamp_surfaces
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
               digests: dict[str, str] | None = None, regions: NDArray[np.float64] | None = None) -> Path:
-    """Write the input of a bake into its folder below `root` and return the folder; finished stages there stay.
+    """`claim_job` for whoever knows that nobody else works below `root`: the folder, unclaimed."""
+    claim = claim_job(root, scene, settings, light, digests, regions)
+    claim.release()
+    return claim.folder
+
+
+def claim_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
+              digests: dict[str, str] | None = None, regions: NDArray[np.float64] | None = None) -> Claim:
+    """Write the input of a bake into its folder below `root`, claimed for this process; finished stages there stay.
 
     digests: of the geometry by object name, kept in the headers. regions: of local lights, see `bake`. Raises
     StorageError where `root` can't be written.
@@ -58,15 +67,27 @@ def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: Refer
         arrays |= {f"light_{name}": value for name, value in light.arrays().items()}
         header["light"] = light.header()
     name = digest_json([digest_arrays(*(np.asarray(arrays[key]) for key in sorted(arrays))), header])
-    folder = root / f"bake-{name[:24]}"
+    claim = _claim(root, f"bake-{name[:24]}")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(str(folder), f"the job folder can't be made ({error.strerror})",
-                           "Choose a folder that can be written") from error
-    if intact(folder / SCENE_FILE) is None:
-        save_arrays(folder / SCENE_FILE, arrays, header)
-    return folder
+        if intact(claim.folder / SCENE_FILE) is None:
+            save_arrays(claim.folder / SCENE_FILE, arrays, header)
+    except BaseException:
+        claim.release()
+        raise
+    return claim
+
+
+def _claim(root: Path, name: str) -> Claim:
+    """The first folder of this name, with a number from the second on, in which nobody works."""
+    for folder in (root / (name if number == 1 else f"{name}-{number}") for number in count(1)):
+        try:
+            claim = Claim.make(folder)
+        except OSError as error:
+            raise StorageError(str(folder), f"the job folder can't be made ({error.strerror})",
+                               "Free some space, or choose a folder that can be written") from error
+        if claim is not None:
+            return claim
+    raise AssertionError("numbers do not end")
 
 
 def _object_header(scene_object: SceneObject) -> dict[str, Any]:
@@ -135,9 +156,9 @@ def read_result(folder: Path) -> BakeResult:
     return BakeResult(objects, stored["report"])
 
 
-def discard(folder: Path) -> None:
-    """Remove a job folder, once its result has been applied or it is not wanted any more."""
-    shutil.rmtree(folder, ignore_errors=True)
+def discard(claim: Claim) -> None:
+    """Remove a job's folder, once its result has been applied or it is not wanted any more."""
+    claim.discard()
 
 
 def job_summary(folder: Path) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+# Exit status of a child that can't even write its messages: it has no other way to say so.
+CANT_WRITE = 28
 # Names of folders of local lights' responses on disk, which can be gigabytes, begin so.
 RESPONSES = "responses-"
 # Half-written files (storage.files.write_atomically).

@@ -20,7 +20,7 @@ from typing import IO, Any
 import scipy
 
 from ..errors import Cancelled, PRTError
-from .leftovers import drop_unfinished
+from .leftovers import CANT_WRITE, drop_unfinished
 
 Message = dict[str, Any]
 
@@ -32,8 +32,9 @@ MESSAGES: dict[str, frozenset[str]] = {
 }
 MESSAGE_FILE = "messages.jsonl"
 ERROR_FILE = "worker_errors.txt"
+FREE_SPACE = "Free some space, or choose a folder that can be written"
 WORKER = Path(__file__).with_name("worker.py")
-KILL_GRACE_SECONDS = 2.0
+END_SECONDS, KILL_SECONDS = 2.0, 0.4  # that a child has for its own end, and for dying when it is told to
 
 
 def raise_error(message: Message) -> None:
@@ -68,24 +69,32 @@ class BakeProcess:
     def start(self) -> None:
         """Start the child. PRTError when Python itself can't be started."""
         command = [*self.python_command, str(WORKER), str(self.job), "--site", _wheels_folder()]
-        messages: IO[bytes]
-        with open(self.job / MESSAGE_FILE, "wb") as messages, open(self.job / ERROR_FILE, "wb") as errors:
-            try:
-                self.process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=messages, stderr=errors, env=_environment(),
-                    creationflags=_creation_flags(),
-                )
-            except OSError as error:
-                raise PRTError(
-                    "Bake process", f"Python could not be started ({error})", "Check the Blender installation"
-                ) from error
+        try:
+            with open(self.job / MESSAGE_FILE, "wb") as messages, open(self.job / ERROR_FILE, "wb") as errors:
+                self._start(command, messages, errors)
+        except OSError as error:
+            raise PRTError(str(self.job), f"the job folder can't be written ({error.strerror})", FREE_SPACE) from error
+
+    def _start(self, command: list[str], messages: IO[bytes], errors: IO[bytes]) -> None:
+        try:
+            self.process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=messages, stderr=errors, env=_environment(),
+                creationflags=_creation_flags(),
+            )
+        except OSError as error:
+            raise PRTError(
+                "Bake process", f"Python could not be started ({error})", "Check the Blender installation"
+            ) from error
 
     def poll(self) -> list[Message]:
         """The messages since the last call; never waits. The last one of a bake is "done" or "error"."""
         if self.finished or self.process is None:
             return []
         ended = self.process.poll() is not None  # asked before reading, so that nothing written before is missed
-        messages = list(self._new_messages())
+        try:
+            messages = list(self._new_messages())
+        except OSError:
+            return [self._lost_folder()]
         if any(message["type"] != "progress" for message in messages):
             self.finished = True
         elif ended:
@@ -108,14 +117,14 @@ class BakeProcess:
         self._cancelled = True
         if self.process is not None and self.process.poll() is None:
             self.process.terminate()
-            self._close()
+            self._close(KILL_SECONDS)
 
-    def _close(self) -> None:
-        """Wait for the child's end, which is due; kill it when it has not come after a short grace."""
+    def _close(self, seconds: float = END_SECONDS) -> None:
+        """Wait for the child's end, which is due; kill it when it has not come after so many seconds."""
         if self.process is None:
             return
         try:
-            self.process.wait(KILL_GRACE_SECONDS)
+            self.process.wait(seconds)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
@@ -135,11 +144,21 @@ class BakeProcess:
                 raise ValueError(f"malformed message of the bake process: {message}")
             yield message
 
+    def _lost_folder(self) -> Message:
+        """End the child whose folder somebody deleted, and the message for it."""
+        self.finished = True
+        self.cancel()
+        return error_message(PRTError("Bake", "its job folder was deleted while it ran",
+                                      "The previous bake is untouched; bake again, and leave the folder alone"))
+
     def _death(self) -> Message:
         """The message for a child that ended without saying why."""
         code = self.returncode
         if self._cancelled:
             return error_message(Cancelled("Bake", "cancelled", "Bake again to resume where it stopped"))
+        if code == CANT_WRITE:
+            return error_message(PRTError(str(self.job), "the disk is full, or the job folder can't be written",
+                                          "The previous bake is untouched; free some space and bake again to resume"))
         last = _last_line(self.job / ERROR_FILE)
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
@@ -152,6 +171,24 @@ class BakeProcess:
         else:
             remedy = "The previous bake is untouched; bake again to resume"
         return error_message(PRTError("Bake", cause, remedy))
+
+
+class CompletedBake:
+    """Stands for the process of a bake that was complete before: its result lies in the job folder already."""
+
+    finished = False
+
+    def poll(self) -> list[Message]:
+        """The end, at once."""
+        self.finished = True
+        return [{"type": "done"}]
+
+    def wait(self, _interval: float = 0.0) -> Iterator[Message]:
+        """As `poll`."""
+        yield from self.poll()
+
+    def cancel(self) -> None:
+        """Nothing runs."""
 
 
 def error_message(error: PRTError) -> Message:

@@ -34,7 +34,7 @@ from ..reporting.wording import plural
 from ..scene.needs import BLACK, GREY_TOLERANCE
 from ..scene.scene_mesh import SceneMesh, SceneObject
 from ..storage.container import BakedTransfer
-from ..storage.files import intact, save_arrays
+from ..storage.files import intact, save_arrays, save_json
 from ..tracing.tracer import Tracer
 from ..transport.buried import buried_receivers, fill_buried, past_buried
 from ..transport.direct import direct_transfer
@@ -70,6 +70,7 @@ from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_wo
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
 POLL_SECONDS = 0.05
+STAGES_FILE = "stages.json"  # in the job folder: the names of this bake's stages, in order
 # Shadow rays of a bake for local lights alone without highlights, where distant light only checks the scene.
 DIRECTIONS_OF_CHECKS = 256
 # Receivers whose layers leave less of the diffuse one than this say nothing about its error.
@@ -154,6 +155,8 @@ class _Bake:
         self.memory_warning = memory_warning(self.plan, self.settings)
         self.timer = StageTimer(lambda: self.tracer.rays if self.tracer else 0)
         self.stage_order = list(self.plan.seconds)
+        if self.folder:
+            save_json(self.folder / STAGES_FILE, self.stage_order)
         with self.timer.stage("prepare"):
             yield self._progress("prepare", 0.0)
             self._prepare()
@@ -648,7 +651,7 @@ class _Bake:
         sample = HighlightSample(keys, rows, compressed, self.surfaces.functions, *self._objects_of(keys))
         return (yield from self._follow("errors", highlight_budget(
             surfaces, sample, self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
-            int(self.glossy_bounce), settings.error_paths, settings.seed), 0.5, 1.0))
+            int(self.glossy_bounce), settings.error_paths, settings.seed, settings.glossy_window), 0.5, 1.0))
 
     def _local_errors(self, encodings: dict[str, Encoding]) -> Generator[Progress, None, dict[str, Any]]:
         """The error budget of lamps' bounced light."""

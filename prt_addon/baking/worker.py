@@ -8,6 +8,7 @@ loads `prt_addon` from its own place on disk first. Threads are fine here: this 
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import importlib.util
 import json
@@ -72,6 +73,17 @@ def be_polite() -> None:
         os.nice(NICENESS)
 
 
+def run_or_give_up(job_folder: Path, clean_up: Callable[[], None], cant_write: int) -> int:
+    """`run`; where its messages can't be written (a full disk), end at once with the status that says so."""
+    try:
+        return run(job_folder)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS):
+            raise
+        clean_up()
+        os._exit(cant_write)  # without a flush of what can't be written
+
+
 def run(job_folder: Path) -> int:
     """Bake the job, with its result left in the folder. Returns the exit status."""
     errors = importlib.import_module(f"{PACKAGE_FOLDER.name}.errors")
@@ -104,8 +116,12 @@ def main() -> int:
     be_polite()
     load_package(PACKAGE_FOLDER)
     leftovers = importlib.import_module(f"{PACKAGE_FOLDER.name}.baking.leftovers")
-    die_with_parent(lambda: leftovers.drop_unfinished(arguments.job))
-    return run(arguments.job)
+
+    def clean_up() -> None:
+        leftovers.drop_unfinished(arguments.job)
+
+    die_with_parent(clean_up)
+    return run_or_give_up(arguments.job, clean_up, leftovers.CANT_WRITE)
 
 
 if __name__ == "__main__":

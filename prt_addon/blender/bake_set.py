@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+UNKNOWN = ""  # the entry of what the viewport hides: taken to be as it was
 SHAPE_CHARACTERS = 32  # of an entry's digest; the place follows
 # Rounding of a chain of single precision transforms, relative to the size of the set. A caster that moves by less than
 # this changes no light that could be seen.
@@ -49,6 +50,8 @@ def changed_piece(then: Mapping[str, str], now: Mapping[str, str], moved: NDArra
     then, now: entries by name as `fingerprint.surroundings` gives them; moved: (4, 4), from then to now. Names do not
     count: a renamed object casts the same shadow. Raises ValueError for entries that are none of ours.
     """
+    unknown = [name for entries in (then, now) for name, entry in entries.items() if entry == UNKNOWN]
+    then, now = (_without(entries, unknown) for entries in (then, now))
     if np.array_equal(moved, np.eye(4)):
         known = set(then.values()), set(now.values())
         then = {name: entry for name, entry in then.items() if entry not in known[1]}
@@ -64,6 +67,14 @@ def changed_piece(then: Mapping[str, str], now: Mapping[str, str], moved: NDArra
         if len(missing):
             return list(names)[missing[0]]
     return None
+
+
+def _without(entries: Mapping[str, str], unknown: Sequence[str]) -> Mapping[str, str]:
+    """The entries but for those of unknown objects and of what these instance."""
+    if not unknown:
+        return entries
+    return {name: entry for name, entry in entries.items()
+            if name not in unknown and not name.startswith(tuple(f"{other}/" for other in unknown))}
 
 
 def _points(then: Sequence[str], now: Sequence[str], moved: NDArray[np.float64],

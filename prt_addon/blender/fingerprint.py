@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..storage.digests import digest_arrays, digest_json
-from .bake_set import pack_place
+from .bake_set import UNKNOWN, pack_place
 from .materials import material_digest
 from .nodes import reachable
 from .visibility import render_visible_objects
@@ -16,6 +16,7 @@ from .visibility import render_visible_objects
 # Attributes that shape the surface or its shading normals; colours and our own data do not, and UV maps count only
 # where a material samples an image through them.
 SHAPING = ("position", ".corner_vert", "material_index", "sharp_face", "sharp_edge", "custom_normal")
+SHAPES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}  # types of objects that show faces
 BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.float32), "INT": ("value", 1, np.int32),
            "BOOLEAN": ("value", 1, np.bool_), "INT16_2D": ("value", 2, np.int32)}
 
@@ -29,7 +30,7 @@ def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgra
     evaluated = scene_object.evaluated_get(depsgraph)
     if not evaluated.is_evaluated:
         return None
-    parts = [_mesh_digest(evaluated.data)] if isinstance(evaluated.data, bpy.types.Mesh) else []
+    parts = [_evaluated_digest(evaluated)] if isinstance(evaluated.data, bpy.types.Mesh) else []
     parts += _uv_digests(scene_object)
     if not _instances_nothing(evaluated):
         to_local = np.linalg.pinv(np.array(scene_object.matrix_world, np.float64))  # small
@@ -49,6 +50,16 @@ def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgra
 def _instances_nothing(evaluated: bpy.types.Object) -> bool:
     return evaluated.type == "MESH" and not evaluated.is_instancer and not evaluated.particle_systems and not any(
         modifier.type == "NODES" for modifier in evaluated.modifiers)
+
+
+def _evaluated_digest(evaluated: bpy.types.Object) -> str:
+    """Of an evaluated object's mesh; in edit mode of the mesh as it is being edited, which has no arrays of its own."""
+    if not evaluated.data.is_editmode:
+        return _mesh_digest(evaluated.data)
+    try:
+        return _mesh_digest(evaluated.to_mesh())
+    finally:
+        evaluated.to_mesh_clear()
 
 
 def _mesh_digest(mesh: bpy.types.Mesh) -> str:
@@ -110,22 +121,25 @@ def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
     """What each render-visible piece of geometry is and where it stands: all that can shadow or light another.
 
     By name of the object, or of instancer and instanced object: a digest of shape and materials, then the place
-    (`bake_set.pack_place`), so that it can be told whether everything moved together. One pass over all meshes; call it
-    once for all baked objects, not per object and redraw.
+    (`bake_set.pack_place`), so that it can be told whether everything moved together. What only the viewport hides is
+    UNKNOWN: Blender does not evaluate it, and taking it for gone would be wrong. One pass over all meshes; call it once
+    for all baked objects, not per object and redraw.
     """
     visible = render_visible_objects(depsgraph.view_layer)
     shapes: dict[str, str] = {}
     places: dict[str, list[NDArray[np.float64]]] = {}
     meshes: dict[int, str] = {}
+    reached: set[str] = set()
     for instance in depsgraph.object_instances:
         owner, source = (instance.parent if instance.is_instance else instance.object).original, instance.object
         mesh = source.data
+        reached.add(owner.name_full)
         if owner.name_full not in visible or not isinstance(mesh, bpy.types.Mesh) or (
                 source.original != owner and source.original.hide_render):
             continue
         pointer = mesh.as_pointer()
         if pointer not in meshes:
-            meshes[pointer] = _mesh_digest(mesh)
+            meshes[pointer] = _evaluated_digest(source)
         place = np.array(instance.matrix_world, np.float64)
         # Geometry that nodes made has its instancer for a source, and many meshes.
         name = owner.name_full if source.original == owner else f"{owner.name_full}/{source.original.name_full}"
@@ -133,14 +147,16 @@ def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
         if key not in places:
             shapes[key] = _shape_digest(meshes[pointer], source, place)
         places.setdefault(key, []).append(place)
-    return {key: _with_place(shapes[key], found) for key, found in places.items()}
+    hidden = {name: UNKNOWN for name, found in visible.items()
+              if name not in reached and (found.type in SHAPES or found.instance_type != "NONE")}
+    return hidden | {key: _with_place(shapes[key], found) for key, found in places.items()}
 
 
 def _shape_digest(mesh: str, source: bpy.types.Object, place: NDArray[np.float64]) -> str:
     """Of a mesh with the materials of the object that shows it; with its size where that counts: light travels through
     bodies by a length of its own."""
     materials = used_materials(source)
-    parts = [mesh, material_digest(materials)]
+    parts = [mesh, material_digest(materials), source.visible_shadow, source.visible_diffuse]
     if any(_is_translucent(node) for material in dict.fromkeys(materials) for node in _nodes_of(material)):
         volume = np.linalg.det(place[:3, :3])  # small
         parts.append(f"{abs(volume) ** (1.0 / 3.0):.4g}")

@@ -65,17 +65,18 @@ class _Gathered:
 
 
 def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | None = None,
-                 warnings: list[str] | None = None) -> list[ObjectMesh]:
+                 warnings: list[str] | None = None, selected: Sequence[str] | None = None) -> list[ObjectMesh]:
     """Every object with geometry that a render shows, in world space (metres), each with all it instances.
 
     depsgraph: of the viewport (`context.evaluated_depsgraph_get()`). target_names: objects to store transfer for; None
     takes the selected ones with geometry, or all if none is selected or Blender runs in the background, without those
-    that have no faces. warnings: gets a line for everything left out. Raises BadScene, naming the object, where a
-    target can't be baked.
+    that have no faces. warnings: gets a line for everything left out. selected: counts in place of what is selected
+    (`selected_names` of an earlier time; empty: nothing was). Raises BadScene, naming the object, where a target can't
+    be baked.
     """
     warnings = [] if warnings is None else warnings
     with shown_as_in_render(depsgraph) as visible:
-        targets = _targets(depsgraph, visible, target_names)
+        targets = _targets(depsgraph, visible, target_names, selected)
         albedo_reader, surface_reader = AlbedoReader(depsgraph.scene, warnings), SurfaceReader(warnings)
         gathered = _gather(depsgraph, visible, (albedo_reader, surface_reader), warnings)
         everything = target_names is None and not targets
@@ -86,18 +87,25 @@ def read_objects(depsgraph: bpy.types.Depsgraph, target_names: Sequence[str] | N
         return [_joined(g, everything or name in targets) for name, g in gathered.items()]
 
 
+def selected_names(view_layer: bpy.types.ViewLayer) -> list[str]:
+    """Full names of the selected objects that have geometry; none in background mode, where nobody selects."""
+    if bpy.app.background:
+        return []
+    return [o.name_full for o in view_layer.objects
+            if o.select_get(view_layer=view_layer) and (o.type == "MESH" or o.is_instancer)]
+
+
 def _targets(depsgraph: bpy.types.Depsgraph, visible: dict[str, bpy.types.Object],
-             target_names: Sequence[str] | None) -> dict[str, bpy.types.Object]:
+             target_names: Sequence[str] | None, selected: Sequence[str] | None) -> dict[str, bpy.types.Object]:
     """Target objects by full name; empty means all."""
+    if selected is None:
+        selected = selected_names(depsgraph.view_layer)
     if target_names is not None:
         if not target_names:
             raise BadScene("scene", "no object was named", "Name at least one mesh object to bake")
         chosen = find_objects(list(target_names), depsgraph.scene)
-    elif bpy.app.background:
-        chosen = []
     else:
-        chosen = [o for o in depsgraph.view_layer.objects
-                  if o.select_get(view_layer=depsgraph.view_layer) and (o.type == "MESH" or o.is_instancer)]
+        chosen = find_objects(list(selected), depsgraph.scene)
     for target in chosen:
         if target.name_full not in visible:
             raise BadScene(target.name, "it is hidden in renders, so it takes no part in the light",
@@ -177,6 +185,24 @@ def read_mesh(mesh: bpy.types.Mesh) -> MeshArrays:
     if count:
         mesh.corner_normals.foreach_get("vector", normals.ravel())
     return MeshArrays(positions, triangles, corners, normals[corners], material_index)
+
+
+def read_object_triangles(evaluated: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """`read_triangles` of an evaluated object, as it is edited and subdivided."""
+    try:
+        return read_triangles(evaluated.to_mesh())
+    finally:
+        evaluated.to_mesh_clear()
+
+
+def read_triangles(mesh: bpy.types.Mesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Positions (v, 3) of a mesh in its own space, and triangles (t, 3)."""
+    mesh.calc_loop_triangles()
+    positions = np.empty((len(mesh.vertices), 3), np.float32)
+    triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+    mesh.vertices.foreach_get("co", positions.ravel())
+    mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+    return positions, triangles
 
 
 def _check_finite(positions: NDArray[np.float32], name: str) -> None:

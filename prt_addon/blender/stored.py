@@ -30,6 +30,7 @@ from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
 NORMAL_ATTRIBUTE, TANGENT_ATTRIBUTE = "prt_normal", "prt_tangent"
 RECEIVER_PROPERTY = "prt_receiver"
+CARRIER_PROPERTY = "prt_carrier"  # on the object that carries a receiver mesh
 RECEIVER_NAME = "PRT {}"
 MOVED = "it was moved, turned or scaled since the bake, and not all that is around it came along"
 MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
@@ -125,14 +126,26 @@ def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
 
 
 def is_receiver(scene_object: bpy.types.Object) -> bool:
-    """Whether this object only carries another one's bake."""
+    """Whether this object only carries another one's bake, which may have been deleted."""
     parent = scene_object.parent
-    return parent is not None and scene_object.data is not None and parent.get(RECEIVER_PROPERTY) == scene_object.data
+    carries = parent is not None and scene_object.data is not None and (
+        parent.get(RECEIVER_PROPERTY) == scene_object.data)
+    return carries or CARRIER_PROPERTY in scene_object
 
 
 def baked_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The scene's objects that have a bake, without the receivers that carry it."""
     return [o for o in scene.objects if baked_mesh(o) is not None and not is_receiver(o)]
+
+
+def clear_orphans(scene: bpy.types.Scene) -> None:
+    """Remove the carriers of bakes whose objects were deleted, with their meshes."""
+    for carrier in list(scene.objects):
+        if CARRIER_PROPERTY in carrier and carrier.library is None and (
+                carrier.parent is None or carrier.parent.get(RECEIVER_PROPERTY) != carrier.data):
+            mesh = carrier.data
+            bpy.data.objects.remove(carrier)
+            _remove_if_unused(mesh, None)
 
 
 def clear_baked(scene_object: bpy.types.Object) -> bool:
@@ -180,11 +193,11 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
         return MOVED
     if then is None or surroundings is None:
         return None
-    if stays:  # of itself more has been asked above
-        then, surroundings = ({name: entry for name, entry in entries.items() if name != scene_object.name_full}
-                              for entries in (then, surroundings))
     try:
         changed = changed_piece(then, surroundings, moved)
+        if stays and changed == scene_object.name_full:  # of itself more has been asked above
+            changed = changed_piece(*({name: entry for name, entry in entries.items() if name != changed}
+                                      for entries in (then, surroundings)), moved)
     except ValueError as error:
         raise StorageError(scene_object.name, f"the header of its baked data states no valid digests ({error})",
                            container.REBAKE) from error
@@ -401,6 +414,7 @@ def _attach_receiver(scene_object: bpy.types.Object, mesh: bpy.types.Mesh, previ
             collection.objects.link(carrier)
     else:
         carrier.data = mesh
+    carrier[CARRIER_PROPERTY] = True
     carrier.hide_render = carrier.hide_viewport = carrier.hide_select = True
     scene_object[RECEIVER_PROPERTY] = mesh
     _remove_if_unused(previous, mesh)

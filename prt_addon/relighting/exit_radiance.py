@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from ..basis.spherical_harmonics import evaluate
+from ..lighting.windowing import for_highlights
 from ..linear_algebra import multiply, sparse_multiply
+from .scene_light import LightingBasis
 
 FloatArray = NDArray[np.float32]
 
@@ -31,6 +33,16 @@ class Baked(Protocol):
     tangents: FloatArray | None
 
     @property
+    def soft_highlights(self) -> bool:
+        """Whether highlights reflect a light that rings less."""
+        ...
+
+    @property
+    def lighting_basis(self) -> LightingBasis:
+        """Which columns belong to distant light."""
+        ...
+
+    @property
     def functions(self) -> tuple[int, ...]:
         """The spherical harmonics of the exit direction that rows 1, 2, ... belong to."""
         ...
@@ -39,6 +51,22 @@ class Baked(Protocol):
     def cluster_zone(self) -> NDArray[np.int32] | None:
         """The zone of the light cloud that each cluster lies in; None without local lights."""
         ...
+
+
+def baked_constants(baked: Baked, light: ArrayLike) -> FloatArray:
+    """`cluster_constants` of a bake, whose rows of the view reflect distant light without most of its ringing
+    (`lighting.windowing.for_highlights`) where it asks for that."""
+    plain = cluster_constants(baked.bases, light, baked.cluster_zone)
+    if not (baked.functions and baked.soft_highlights and baked.lighting_basis.distant):
+        return plain
+    light = np.asarray(light, np.float32)
+    softer, distant = light.copy(), baked.lighting_basis.distant
+    shared = light[:distant] if light.ndim == 2 else light[0, :distant]  # distant light is the same in every zone
+    softer[..., :distant, :] = for_highlights(shared)
+    if np.array_equal(softer, light):
+        return plain
+    rows = np.ascontiguousarray(baked.bases[:, :, 1:])
+    return np.concatenate([plain[:, :, :1], cluster_constants(rows, softer, baked.cluster_zone)], axis=2)
 
 
 def cluster_constants(bases: FloatArray, light: ArrayLike, cluster_zone: NDArray[np.integer] | None = None,
@@ -130,7 +158,7 @@ def view_radiance(baked: Baked, light: ArrayLike, views: ArrayLike, direct: Floa
     views = np.asarray(views, np.float64)
     if views.shape != baked.normals.shape:
         raise ValueError(f"one view for each of {len(baked.normals)} receivers is needed, not {views.shape}")
-    constants = cluster_constants(baked.bases, light, baked.cluster_zone)
+    constants = baked_constants(baked, light)
     rows = exit_radiance(baked.cluster, baked.weights, constants)
     if direct is not None:
         rows = rows + direct

@@ -94,6 +94,11 @@ class BakedTransfer:
         return self.bases.shape[3]
 
     @property
+    def soft_highlights(self) -> bool:
+        """Whether highlights reflect a light that rings less (`lighting.windowing.for_highlights`)."""
+        return bool(self.header.get("settings", {}).get("glossy_window", False))
+
+    @property
     def lighting_basis(self) -> Columns:
         """What the columns stand for."""
         part = cloud_part(self.header.get("columns"))

@@ -98,6 +98,46 @@ def test_a_copy_of_a_baked_object_is_stale_where_it_stands(scene: bpy.types.Scen
     assert "moved" in why(full)
 
 
+def test_what_only_the_viewport_hides_is_as_it_was(scene: bpy.types.Scene) -> None:
+    """Renders still show it, so it still casts its shadow; hidden in renders it is gone."""
+    _, cubes = three(scene)
+    for hide in (lambda off: cubes[1].hide_set(off), lambda off: setattr(cubes[1], "hide_viewport", off)):
+        hide(True)
+        assert why(cubes[0]) is None
+        cubes[2].location.x += 0.1
+        assert "Wall" in why(cubes[0])
+        cubes[2].location.x -= 0.1
+        hide(False)
+        assert why(cubes[0]) is None
+    cubes[1].hide_render = True
+    assert "Floor" in why(cubes[0])
+
+
+def test_what_was_hidden_at_the_bake_counts_as_unknown(scene: bpy.types.Scene) -> None:
+    _, cubes = three(scene)
+    cubes[1].hide_set(True)
+    stored.write_baked(cubes[0], bake_of(cubes[0]), None, fingerprint.surroundings(depsgraph()))
+    assert why(cubes[0]) is None
+    cubes[1].hide_set(False)
+    assert why(cubes[0]) is None
+
+
+def test_edit_mode_alone_changes_nothing(scene: bpy.types.Scene) -> None:
+    """Nor do sculpting and painting before the first stroke; an edit does at once."""
+    _, cubes = three(scene)
+    bpy.context.view_layer.objects.active = cubes[1]
+    for mode in ("EDIT", "SCULPT", "WEIGHT_PAINT", "VERTEX_PAINT"):
+        bpy.ops.object.mode_set(mode=mode)
+        assert why(cubes[0]) is None, mode
+        bpy.ops.object.mode_set(mode="OBJECT")
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.transform.translate(value=(0.0, 0.0, 0.1))
+    assert "Floor" in why(cubes[0])
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert "Floor" in why(cubes[0])
+
+
 def test_an_instanced_collection_counts_like_its_objects(scene: bpy.types.Scene) -> None:
     """Where the whole set is shown through an empty, nothing has changed for the pieces."""
     _, cubes = three(scene)

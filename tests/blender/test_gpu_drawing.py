@@ -16,6 +16,7 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 # isort: split
 from prt.gpu_shaders import draw, offscreen, programs, render_data
 from prt.prt_addon.errors import BadArguments, BadScene, PRTError
+from prt.prt_addon.relighting.exit_radiance import cluster_constants
 
 SIZE = 100  # pixels per side of the test pictures
 TOLERANCE = 2e-3  # of the brightest value
@@ -91,7 +92,7 @@ def test_picture_equals_interpolated_radiance_times_albedo(scene: Any, vectors: 
 def test_exit_radiance_of_every_point(clusters: int, vectors: int, channels: int, rows: int) -> None:
     baked, light = bake(61, clusters=clusters, vectors=vectors, channels=channels, rows=rows, columns=9)
     drawing = draw.ObjectDrawing(render_data.make_render_data(baked))
-    drawing.relight(draw.cluster_constants(baked.bases, light.astype(np.float32)))
+    drawing.relight(cluster_constants(baked.bases, light.astype(np.float32)))
     expected = gpu_support.expected_radiance(baked, light)
     assert np.abs(drawing.exit_radiances() - expected).max() < 1e-5 * np.abs(expected).max()
 
@@ -103,7 +104,7 @@ def test_a_million_points() -> None:
     baked = gpu_support.made_up_bake(points, triangles, generator, clusters=300, vectors=3, columns=4)
     light = gpu_support.bright_light(4, generator)
     drawing = draw.ObjectDrawing(render_data.make_render_data(baked))
-    drawing.relight(draw.cluster_constants(baked.bases, light.astype(np.float32)))
+    drawing.relight(cluster_constants(baked.bases, light.astype(np.float32)))
     expected = gpu_support.expected_radiance(baked, light)
     assert np.abs(drawing.exit_radiances() - expected).max() < 1e-5 * np.abs(expected).max()
 

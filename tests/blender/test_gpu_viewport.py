@@ -18,7 +18,7 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 
 # isort: split
 import gpu
-from prt.gpu_shaders import draw, offscreen, programs, render_data, viewport
+from prt.gpu_shaders import draw, occluders, offscreen, programs, render_data, viewport
 from prt.prt_addon.errors import BadScene
 
 
@@ -165,6 +165,27 @@ def test_a_complete_list_hides_by_its_own_depth(
     assert covered(draw_redraw(handlers, monkeypatch, depth=0.0))
     complete[0] = False
     assert not draw_redraw(handlers, monkeypatch, depth=0.0).any()
+
+
+@pytest.mark.parametrize(("height", "hidden"), [(-0.5, True), (0.5, False)])
+def test_others_hide_where_the_engine_leaves_no_depth(
+    handlers: list, monkeypatch: pytest.MonkeyPatch, item: render_data.DrawItem, height: float, hidden: bool
+) -> None:
+    """A square over the left half, in front (towards -1 in clip space) or behind; it is read once."""
+    corners = np.array([[-1, -1, height], [0, -1, height], [0, 1, height], [-1, 1, height]], np.float32)
+    reads = []
+
+    def read() -> tuple[np.ndarray, np.ndarray]:
+        reads.append(1)
+        return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+    viewport.enable(lambda: [item], get_occluders=lambda: [occluders.Occluder("square", np.eye(4), read)])
+    for _ in range(2):
+        pixels = draw_redraw(handlers, monkeypatch, depth=0.0, space=space_data("RENDERED", overlays=False))
+        assert pixels[8:24, 20:24].all() and pixels[8:24, 8:12].any() != hidden
+    assert len(reads) == 1 and len(viewport._active.occluders) == 1
+    pixels = draw_redraw(handlers, monkeypatch, depth=1.0, space=space_data("RENDERED"))
+    assert covered(pixels), "where Blender's own depth is there, nobody else is asked"
 
 
 @pytest.mark.parametrize("space", [space_data("WIREFRAME"), space_data("SOLID", xray=True)])

@@ -17,7 +17,7 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 # isort: split
 from prt.gpu_shaders import draw, hemisphere_glsl, offscreen, programs, render_data
 from prt.prt_addon.basis.spherical_harmonics import rotation
-from prt.prt_addon.relighting.exit_radiance import combine_rows, hemisphere_values, view_radiance
+from prt.prt_addon.relighting.exit_radiance import cluster_constants, combine_rows, hemisphere_values, view_radiance
 
 SIZE = 90
 TOLERANCE = 2e-3  # of the brightest value
@@ -268,7 +268,7 @@ def test_a_cluster_sums_its_own_vectors_only() -> None:
         baked.bases[cluster, 1 + own:] = 0.0
     data = render_data.make_render_data(baked)
     assert data.cluster_vectors.tolist() == [0, 3, 7]
-    constants = draw.cluster_constants(baked.bases, light.astype(np.float32))
+    constants = cluster_constants(baked.bases, light.astype(np.float32))
     for cluster, own in enumerate((0, 3, 7)):
         constants[cluster, 1 + own:] = 1e6  # would show if it were read
     drawing = draw.ObjectDrawing(data)

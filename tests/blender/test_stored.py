@@ -436,3 +436,16 @@ def test_edit_mode_is_said_not_misread(scene: bpy.types.Scene) -> None:
     stored.write_baked(sphere, baked)
     bpy.ops.object.mode_set(mode="OBJECT")
     assert_same(stored.read_baked(sphere), baked)
+
+
+def test_what_a_deleted_object_leaves_is_no_baked_object(scene: bpy.types.Scene) -> None:
+    cube = add_cube()
+    cube.modifiers.new("Bevel", "BEVEL")
+    stored.write_baked(cube, bake_of(cube))
+    assert len(scene.objects) == 2
+    stored.clear_orphans(scene)
+    assert len(scene.objects) == 2
+    bpy.data.objects.remove(cube)
+    assert not stored.baked_objects(scene)
+    stored.clear_orphans(scene)
+    assert not scene.objects and not [m for m in bpy.data.meshes if m.name.startswith("PRT ")]

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scipy.special import sph_harm_y
 
+from prt_addon.basis import spherical_harmonics
+from prt_addon.lighting.windowing import for_highlights
 from prt_addon.relighting.exit_radiance import cluster_constants, diffuse_radiance, exit_radiance, view_radiance
 
 
@@ -103,7 +105,7 @@ def glossy_baked(points: int, functions: tuple[int, ...]) -> SimpleNamespace:
     frame = np.linalg.qr(random.normal(size=(points, 3, 3)))[0].transpose(0, 2, 1)
     frame[:, 2] = np.cross(frame[:, 0], frame[:, 1])  # right-handed: tangent, bitangent, normal
     baked.tangents, baked.normals = frame[:, 0].astype(np.float32), frame[:, 2].astype(np.float32)
-    baked.functions, baked.frame = functions, frame
+    baked.functions, baked.frame, baked.soft_highlights = functions, frame, False
     return baked
 
 
@@ -140,3 +142,23 @@ def test_view_radiance_of_diffuse_transfer_and_misfits() -> None:
     wrong.functions = (0, 1)
     with pytest.raises(ValueError, match="4 rows"):
         view_radiance(wrong, wrong.light, views)
+
+
+def test_only_rows_of_the_view_reflect_the_softer_light() -> None:
+    """And only distant light of it: columns of lamps come after it, in zones or not."""
+    baked = glossy_baked(60, tuple(range(9)))  # of 9 columns
+    baked.lighting_basis, baked.soft_highlights = SimpleNamespace(distant=4), True
+    sun = np.full_like(baked.light, 0.7)
+    sun[:4] = spherical_harmonics.evaluate(2, np.array([[0.6, 0.0, 0.8]]))[0][:, None] * (3.0, 2.0, 1.0)
+    softer = np.concatenate([for_highlights(sun[:4]), sun[4:]])
+    assert np.abs(softer[:4] - sun[:4]).max() > 0.1
+    views = np.random.default_rng(4).normal(size=(60, 3))
+    for light in (sun, np.stack([sun, sun])):
+        baked.cluster_zone = np.arange(len(baked.bases), dtype=np.int32) % 2 if light.ndim == 3 else None
+        found = view_radiance(baked, light, views)
+        diffuse, soft = SimpleNamespace(**vars(baked)), SimpleNamespace(**vars(baked))
+        diffuse.functions, diffuse.bases = (), np.ascontiguousarray(baked.bases[:, :, :1])
+        expected = view_radiance(diffuse, sun if light.ndim == 2 else light, views)
+        soft.albedo, soft.soft_highlights = np.zeros_like(baked.albedo), False
+        expected = expected + view_radiance(soft, softer if light.ndim == 2 else np.stack([softer] * 2), views)
+        assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())

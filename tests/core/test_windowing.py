@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from prt_addon.basis.directions import spherical_fibonacci
-from prt_addon.basis.spherical_harmonics import evaluate, expand_bands, window
+from prt_addon.basis.spherical_harmonics import evaluate, expand_bands, rotate, window
 from prt_addon.lighting.analytic import constant, sun
 from prt_addon.lighting.environment import apply_bands
-from prt_addon.lighting.windowing import remove_ringing
+from prt_addon.lighting.windowing import HIGHLIGHT_TOLERANCE, for_highlights, remove_ringing
 
 DIRECTIONS = spherical_fibonacci(10_000)  # finer than the product's own check
 
@@ -73,3 +73,19 @@ def test_factors_fit_the_coefficients() -> None:
     assert result.factors.shape == (7,) and expand_bands(result.factors).shape == (49,)
     with pytest.raises(ValueError, match="bands"):
         remove_ringing(np.ones((7, 3)))
+
+
+def test_highlights_reflect_a_light_that_rings_less() -> None:
+    """No further below black than its tolerance, the mean kept; what does not ring so much comes back to the bit; a
+    turned light is windowed as the light is."""
+    turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    for order in (3, 5, 8):
+        light = sun((0, 0.6, 0.8), (3, 2, 1), 0.01, order) + constant((0.2, 0.3, 0.4), order)
+        found = for_highlights(light)
+        lowest = (evaluate(order, DIRECTIONS) @ found).min(axis=0) / (found[0] / np.sqrt(4 * np.pi))
+        assert lowest.min() > -HIGHLIGHT_TOLERANCE - 0.02
+        assert np.allclose(found[0], light[0])
+        assert np.allclose(for_highlights(rotate(light, turn)), rotate(found, turn), atol=2e-2 * np.abs(found).max())
+    light = sun((0, 0.6, 0.8), (3, 2, 1), 0.01, 5) + constant((9.0, 9.0, 9.0), 5)
+    assert np.array_equal(for_highlights(light), light)
+    assert np.array_equal(for_highlights(np.zeros((25, 3))), np.zeros((25, 3)))

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Generator
-from importlib import import_module
 from pathlib import Path
 
 import bpy
@@ -23,9 +22,9 @@ from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).parent))  # Blender runs this file by its path
 
+from comparing import core, levels
 from driving import (
     DRAWN,
-    MODULE,
     SCENE,
     Step,
     area,
@@ -54,11 +53,6 @@ OTHERS: set[Path] = set()
 RIM = 0.35  # cosine
 PATIENCE = 40.0  # seconds
 FACES = ((-0.026, 0.133, 0.3), (0.367, -0.026, 0.3))  # of the box, towards the red wall and away from it
-
-
-def core(name: str) -> object:
-    """A module of the installed extension."""
-    return import_module(f"{MODULE}.{name}")
 
 
 def lamp(name: str = "Lamp") -> bpy.types.Object:
@@ -108,17 +102,6 @@ def seen(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         inner[index] = hit and (where - Vector(positions[index])).length < 0.01
     inner &= (column > box.x + 60) & (column < box.x + box.width - 330) & (row > 130) & (row < 985 - box.y)
     return inner, np.stack([row, column], axis=1)[inner]
-
-
-def levels(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Levels (n, 3) of a picture at places (n, 2), blended between the middles of pixels."""
-    first = np.floor(places - 0.5).astype(int)
-    row, column = (places - 0.5 - first).T[:, :, None]
-    top, left = first.T
-    values = picture.astype(float)
-    upper = values[top, left] * (1.0 - column) + values[top, left + 1] * column
-    lower = values[top + 1, left] * (1.0 - column) + values[top + 1, left + 1] * column
-    return upper * (1.0 - row) + lower * row
 
 
 def at_vertices(picture: np.ndarray) -> np.ndarray:
@@ -241,15 +224,15 @@ def drag() -> Step:
     first = shoot("l05_before_drag")
     begin, end, moves = Vector(lamp().location), Vector((-0.6, 0.2, 0.9)), 12
     left, right = (-0.98, 0.2, 0.9), (0.98, -0.1, 1.3)
-    levels = [(colour_at(first, left)[0], colour_at(first, right).mean())]
+    walls = [(colour_at(first, left)[0], colour_at(first, right).mean())]
     for move in range(1, moves + 1):
         lamp().location = begin.lerp(end, move / moves)
         yield 0.15
         if move % 4 == 0:
             picture = shoot(f"l05_drag_{move}")
-            levels.append((colour_at(picture, left)[0], colour_at(picture, right).mean()))
+            walls.append((colour_at(picture, left)[0], colour_at(picture, right).mean()))
     yield from check_picture("l06_after_drag")
-    lefts, rights = zip(*levels, strict=True)
+    lefts, rights = zip(*walls, strict=True)
     assert all(np.diff(lefts) > 0), f"the red wall does not brighten as the lamp comes near: {lefts}"
     assert all(np.diff(rights) < 0), f"the right wall does not darken as the lamp goes: {rights}"
     redness = [colour_at(first, place)[0] / colour_at(first, place)[2] for place in FACES]

@@ -30,11 +30,20 @@ UI_SECONDS = 600
 SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
+    "faults": ("faults_in_blender.py", "make_scene.py"),
+    "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
     "views": ("views_in_blender.py", "make_views.py"),
+    "changes": ("changes_in_blender.py", "make_views.py"),
     "display": ("display_in_blender.py", "make_display.py"),
 }
+RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
+# What may not stand in a log: tracebacks, and warnings of Blender's own log (of the GPU module above all).
+COMPLAINT = re.compile(r"^Traceback|^Exception ignored|\| (WARNING|ERROR|FATAL) |^(Warning|Error)\b|Validation")
+# Reports of operators to the user, which the tests ask for, and what this Blender says on any machine like this one.
+EXPECTED = re.compile(r"\| operator +\||^\S+ +operator +\||Could not get a list of mounted file-systems|"
+                      r"matches no enum in|XDG_RUNTIME_DIR|CUEW")
 
 
 class Blender:
@@ -54,11 +63,12 @@ class Blender:
         return subprocess.Popen([*self.headless, *arguments], env=self.environment, stdout=subprocess.PIPE,
                                 stderr=subprocess.PIPE, text=True, start_new_session=True)
 
-    def script(self, name: str, *arguments: str) -> None:
-        """Run a script with the interface; its output lands in the output folder."""
-        with open(self.output / f"{name}.log", "w", encoding="utf-8") as log:
-            subprocess.run([*self.ui, "--python-exit-code", "1", "--python", str(HERE / name), "--", *arguments],
-                           env=self.environment, stdout=log, stderr=subprocess.STDOUT, timeout=UI_SECONDS, check=False)
+    def script(self, name: str, *arguments: str, options: tuple[str, ...] = (), log_name: str = "") -> None:
+        """Run a script with the interface, options being Blender's; its output lands in the output folder."""
+        with open(self.output / f"{log_name or Path(name).name}.log", "w", encoding="utf-8") as log:
+            subprocess.run([*self.ui, *options, "--python-exit-code", "1", "--python", str(HERE / name), "--",
+                             *arguments], env=self.environment, stdout=log, stderr=subprocess.STDOUT,
+                            timeout=UI_SECONDS, check=False)
 
 
 def results(done: subprocess.CompletedProcess[str]) -> list[str]:
@@ -160,13 +170,46 @@ def blender_process(output: Path) -> int:
     raise AssertionError("Blender is not running")
 
 
-def interface_results(blender: Blender, script: str, results: str, scene: Path) -> list[tuple[str, str]]:
-    """Name and failure (empty: passed) of each step that a script took."""
+def interface_results(blender: Blender, script: str, results: str, scene: Path, vulkan: bool = False,
+                      ) -> list[tuple[str, str]]:
+    """Name and failure (empty: passed) of each step that a script took, and whether its log is clean."""
+    if script == RESTARTED:
+        return restarted_results(blender, script, scene)
     results = blender.output / results
-    blender.script(script, str(blender.output), str(scene))
+    results.unlink(missing_ok=True)
+    log_name = f"{script}.vulkan" if vulkan else script
+    blender.script(script, str(blender.output), str(scene), options=("--gpu-backend", "vulkan") if vulkan else (),
+                   log_name=log_name)
+    log = blender.output / f"{log_name}.log"
     if not results.is_file():
-        return [(script, f"left no results; see {blender.output / f'{script}.log'}")]
-    return [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+        return [(script, f"left no results; see {log}")]
+    complaints = complaints_in(log.read_text(encoding="utf-8", errors="replace"))
+    found = [*json.loads(results.read_text(encoding="utf-8")), (f"log of {log_name}", "\n    ".join(complaints))]
+    if vulkan and "drawn by VULKAN" not in log.read_text(encoding="utf-8", errors="replace"):
+        found.append((log_name, "Blender did not draw by Vulkan"))
+    return [(f"{name} (Vulkan)" if vulkan else name, failure) for name, failure in found]
+
+
+def complaints_in(log: str) -> list[str]:
+    """Lines of a log that should not be there, each once."""
+    return list(dict.fromkeys(line for line in log.splitlines()
+                              if COMPLAINT.search(line) and not EXPECTED.search(line)))
+
+
+def restarted_results(blender: Blender, script: str, scene: Path) -> list[tuple[str, str]]:
+    """`interface_results` of the script that is started again as long as killed.again holds the next start's number."""
+    again, number, outcomes = blender.output / "killed.again", 1, []
+    while number:
+        blender.script(script, str(blender.output), str(scene))
+        (blender.output / f"{script}.log").replace(blender.output / f"{script}.{number}.log")
+        results = blender.output / f"killed_{number}.json"
+        if results.is_file():
+            outcomes += [(name, failure) for name, failure in json.loads(results.read_text(encoding="utf-8"))]
+        following = int(again.read_text()) if again.is_file() else 0
+        if not results.is_file() and following <= number:
+            outcomes.append((script, f"start {number} left no results; see {script}.{number}.log"))
+        number = following if following > number else 0
+    return outcomes
 
 
 def make_scene(blender: Blender, script: str, outcomes: list[tuple[str, str]]) -> Path:
@@ -192,7 +235,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--ui", default="blender")
     parser.add_argument("--headless", default="blender --background")
-    parser.add_argument("--only", choices=("commands", *SCRIPTS), default=None)
+    parser.add_argument("--only", choices=("commands", "vulkan", *SCRIPTS), default=None)
     arguments = parser.parse_args()
     output = arguments.output.resolve()
     shutil.rmtree(output, ignore_errors=True)
@@ -208,6 +251,9 @@ def main() -> int:
         for name, (script, maker) in SCRIPTS.items():
             if arguments.only in (None, name):
                 outcomes += interface_results(blender, script, f"{name}.json", make_scene(blender, maker, outcomes))
+        if arguments.only in (None, "vulkan"):
+            script, maker = SCRIPTS["views"]
+            outcomes += interface_results(blender, script, "views.json", make_scene(blender, maker, outcomes), True)
     for name, failure in outcomes:
         print(f"{'failed' if failure else 'passed'}: {name}" + (f"\n    {failure}" if failure else ""))
     failed = sum(bool(failure) for _, failure in outcomes)
