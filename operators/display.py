@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,29 +43,36 @@ class Display:
     made_of: tuple[BakedTransfer, ...] = ()
     colours: dict[str, FalseColours] = field(default_factory=dict)
     legend: Legend | None = None
-    overlays: dict[Hashable, tuple[Overlay, ...]] = field(default_factory=dict)
+    marked: tuple[BakedTransfer, ...] = ()
+    overlays: dict[str, tuple[Overlay, ...]] = field(default_factory=dict)  # by the first object of each cloud
 
     def colours_of(self, mode: str, shown: Shown) -> dict[str, FalseColours]:
         """False colours by object; none where light is shown."""
-        same = len(self.made_of) == len(shown) and all(map(operator.is_, self.made_of, shown.values()))
-        if mode != self.mode or not same:
+        if mode != self.mode or not _same(self.made_of, shown):
             self.mode, self.made_of = mode, tuple(shown.values())
             self.colours, self.legend = MAKERS[mode](shown) if mode in MAKERS and shown else ({}, None)
         return self.colours
 
     def marks(self, shown: Shown, moves: Mapping[str, NDArray[np.float64] | None], show_cloud: bool) -> Marks:
         """The legend, and the lights or patches of each cloud once, moved as the first object of it is."""
-        found = {}
-        if show_cloud:
+        if not show_cloud:
+            self.marked, self.overlays = (), {}
+        elif not _same(self.marked, shown):
+            self.marked, first = tuple(shown.values()), {}
             for name, baked in shown.items():
                 if baked.cloud is not None:
-                    found.setdefault(cloud_key(baked), (name, baked.cloud))
-        self.overlays = {key: self.overlays.get(key) or cloud_overlays(cloud) for key, (_, cloud) in found.items()}
-        if not found and self.legend is None:
+                    first.setdefault(cloud_key(baked), name)
+            self.overlays = {name: cloud_overlays(shown[name].cloud) for name in first.values()}
+        if not self.overlays and self.legend is None:
             return NOTHING
         placed = [(overlay, np.eye(4) if moves.get(name) is None else moves[name])
-                  for key, (name, _) in found.items() for overlay in self.overlays[key]]
+                  for name, overlays in self.overlays.items() for overlay in overlays]
         return Marks(tuple(placed), self.legend)
+
+
+def _same(bakes: tuple[BakedTransfer, ...], shown: Shown) -> bool:
+    """Whether these are the very bakes that are shown, in order."""
+    return len(bakes) == len(shown) and all(map(operator.is_, bakes, shown.values()))
 
 
 def _clusters(bakes: Mapping[str, BakedTransfer]) -> tuple[dict[str, FalseColours], Legend]:
