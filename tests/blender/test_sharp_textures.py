@@ -323,3 +323,53 @@ def test_a_missing_image_falls_back_to_the_points(lit: Any) -> None:
     pictures = [offscreen.draw_items(bpy.context.scene, [DrawItem("Plane", baked, np.eye(4), light, textures=used)],
                                      WIDTH, HEIGHT) for used in (textures, None)]
     assert np.array_equal(*pictures)
+
+
+@pytest.mark.parametrize("kind", ["mirrored", "subdivided", "instanced"])
+def test_whatever_makes_the_mesh(lit: Any, tmp_path: Path, kind: str) -> None:
+    """A mirrored object, one with a modifier and a collection instance: their triangles are found all the same."""
+    plane = add_plane(image_material("Checker", add_image("checker", checker()))[0])
+    name = "Plane"
+    if kind == "mirrored":
+        plane.scale = (-1.0, 0.8, 1.0)
+    elif kind == "subdivided":
+        modifier = plane.modifiers.new("Subdivision", "SUBSURF")
+        modifier.subdivision_type, modifier.levels = "SIMPLE", 3
+    else:
+        collection = bpy.data.collections.new("Instanced")
+        bpy.context.scene.collection.objects.unlink(plane)
+        collection.objects.link(plane)
+        empty = bpy.data.objects.new("Instance", None)
+        empty.instance_type, empty.instance_collection = "COLLECTION", collection
+        empty.rotation_euler = (0.0, 0.0, 0.5)
+        bpy.context.scene.collection.objects.link(empty)
+        name = "Instance"
+    bake_and_store(name, spacing=0.3 if kind == "mirrored" else 0.0)
+    if kind == "instanced":  # its materials are not in slots of its own: stays per vertex, as before
+        empty = bpy.data.objects[name]
+        assert image_albedo.surface_textures(empty, stored.read_baked(empty), depsgraph()) is None
+    else:
+        assert difference(drawn((name,)), rendered(tmp_path)) < 0.01
+
+
+@pytest.mark.parametrize("functions", [(), tuple(range(9))])
+def test_view_dependent_light_is_no_part_of_the_texture(lit: Any, functions: tuple[int, ...]) -> None:
+    """A texture that is linear in its place, beside points that have its value: the same picture by both programs."""
+    from prt.prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
+
+    generator = np.random.default_rng(6)
+    points, triangles = gpu_support.grid_mesh(9, generator)
+    baked = gpu_support.made_up_bake(points, triangles, generator, clusters=4, vectors=2, functions=functions)
+    ramp = np.ones((64, 64, 4))
+    ramp[..., 0], ramp[..., 1] = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(64) + 0.5) / 64)
+    ramp[..., 2] = 0.5
+    add_image("ramp", ramp, "Linear Rec.709", is_float=True)
+    places = (0.5 + 0.45 * points[:, :2]).astype(np.float32)
+    baked.albedo[:] = np.concatenate([places, np.full((len(points), 1), 0.5)], axis=1) * (0.9, 0.8, 0.7)
+    use = TextureUse(("ramp", None), (0.9, 0.8, 0.7), True, "REPEAT")
+    textures = SurfaceTextures((use,), np.zeros(len(triangles), np.int32), places[triangles], "ramp")
+    light = gpu_support.bright_light(25, generator)
+    pictures = [offscreen.draw_items(bpy.context.scene, [DrawItem("A", baked, np.eye(4), light, textures=used)],
+                                     WIDTH, HEIGHT, samples=1) for used in (textures, None)]
+    assert (pictures[0][..., 3] > 0.0).mean() > 0.2
+    assert np.abs(pictures[0] - pictures[1]).max() < 2e-3 * pictures[1].max()
