@@ -8,6 +8,7 @@ transform is applied by `write_png`, through Blender's own saving of renders.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import subprocess
@@ -25,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..prt_addon.errors import BadArguments, BadScene, PRTError
 from ..prt_addon.lighting.environment import pixel_of_direction
 from ..prt_addon.storage.files import write_atomically
+from . import programs
 from .draw import DrawingCache, read_texture
 from .render_data import LARGEST_TEXTURE, DrawItem
 
@@ -51,6 +53,7 @@ def prepare_gpu() -> None:
             "Install OpenGL or Vulkan drivers (on Linux Mesa with libEGL), or use `relight`, which needs none",
         )
     gpu.init()
+    atexit.register(programs.release)  # a script's sys.exit ends Python after Blender's GPU module, which crashes
 
 
 def _probe_command() -> list[str]:
@@ -96,7 +99,18 @@ def draw_items(
     Raises BadArguments for a size that does not fit, BadScene for a camera or a light that does not, PRTError without
     a graphics driver.
     """
-    view_projection = camera_view_projection(scene, width, height)
+    return draw_view(items, camera_view_projection(scene, width, height), width, height, background, samples)
+
+
+def draw_view(
+    items: Sequence[DrawItem],
+    view_projection: NDArray[np.float64],
+    width: int,
+    height: int,
+    background: ArrayLike | None = None,
+    samples: int = 2,
+) -> NDArray[np.float32]:
+    """As `draw_items`, seen through any (4, 4) from world to clip space."""
     prepare_gpu()
     samples = max(1, min(samples, LARGEST_TEXTURE // max(width, height)))
     cache = DrawingCache()
@@ -167,7 +181,14 @@ def camera_background(
 
     sample: radiance (n, 3) of unit world directions (n, 3) that point away from the camera.
     """
-    inverse = np.linalg.inv(camera_view_projection(scene, width, height))  # small
+    return view_background(camera_view_projection(scene, width, height), sample, width, height)
+
+
+def view_background(
+    view_projection: NDArray[np.float64], sample: Callable[[NDArray[np.float64]], ArrayLike], width: int, height: int
+) -> NDArray[np.float32]:
+    """As `camera_background`, seen through any (4, 4) from world to clip space."""
+    inverse = np.linalg.inv(view_projection)  # small
     columns = (np.arange(width) + 0.5) / width * 2.0 - 1.0
     rows = 1.0 - (np.arange(height) + 0.5) / height * 2.0
     # A pixel's points on the near and far planes are affine in its place; far - near is its direction, for
@@ -216,6 +237,12 @@ def write_png(path: Path, picture: NDArray[np.floating], scene: bpy.types.Scene)
 
     Fully opaque pictures become RGB. The file is complete or absent. Raises StorageError where it can't be written.
     """
+    content = png_bytes(picture, scene)
+    write_atomically(path, lambda stream: stream.write(content) and None)
+
+
+def png_bytes(picture: NDArray[np.floating], scene: bpy.types.Scene) -> bytes:
+    """A scene-linear picture (height, width, 4), row 0 up, as an 8 bit PNG with the scene's view transform."""
     height, width, _ = picture.shape
     image = bpy.data.images.new("PRT preview", width, height, alpha=True, float_buffer=True)
     try:
@@ -224,10 +251,9 @@ def write_png(path: Path, picture: NDArray[np.floating], scene: bpy.types.Scene)
         with tempfile.TemporaryDirectory() as folder, _png_settings(scene, "RGB" if opaque else "RGBA"):
             beside = Path(folder) / "preview.png"
             image.save_render(str(beside), scene=scene)
-            content = beside.read_bytes()
+            return beside.read_bytes()
     finally:
         bpy.data.images.remove(image)
-    write_atomically(path, lambda stream: stream.write(content) and None)
 
 
 @contextlib.contextmanager
@@ -242,6 +268,8 @@ def _png_settings(scene: bpy.types.Scene, color_mode: str) -> Iterator[None]:
         "color_management": "FOLLOW_SCENE",
     }
     before = {name: getattr(settings, name) for name in wanted if hasattr(settings, name)}
+    # Blender sets it along with the format; of some formats it has none, and warns of asking for it.
+    space = "" if settings.file_format == "PNG" else settings.linear_colorspace_settings.name
     try:
         for name in before:
             setattr(settings, name, wanted[name])
@@ -249,3 +277,5 @@ def _png_settings(scene: bpy.types.Scene, color_mode: str) -> Iterator[None]:
     finally:
         for name, value in before.items():
             setattr(settings, name, value)
+        if space:
+            settings.linear_colorspace_settings.name = space

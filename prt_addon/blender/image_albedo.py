@@ -192,20 +192,23 @@ def _placed_parts(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph
     to_local = np.linalg.inv(np.array(scene_object.matrix_world, np.float64))  # small
     meshes: dict[int, _Part] = {}
     matrices: dict[int, list[NDArray[np.float64]]] = {}
+    elsewhere: list[_Part] = []  # where it is shown by instances of its collection alone
     for instance in depsgraph.object_instances:
-        owner = (instance.parent if instance.is_instance else instance.object).original
+        source, owner = instance.object.original, (instance.parent or instance.object).original
+        if source == scene_object != owner and isinstance(instance.object.data, bpy.types.Mesh) and not elsewhere:
+            elsewhere.append(_read_part(instance.object, False, depsgraph))
         if owner != scene_object or not isinstance(instance.object.data, bpy.types.Mesh) or (
-                instance.object.original != owner and instance.object.original.hide_render):
+                source != owner and source.hide_render):
             continue
         if not instance.is_instance and owner.is_instancer and not owner.show_instancer_for_render:
             continue
         key = instance.object.data.as_pointer()
         if key not in meshes:
-            generated = instance.is_instance and instance.object.original == owner
+            generated = instance.is_instance and source == owner
             meshes[key] = _read_part(instance.object, generated, depsgraph)
         matrices.setdefault(key, []).append(to_local @ np.array(instance.matrix_world, np.float64))  # small
     return [(transform_rows(part[0], matrix[:3, :3]) + matrix[:3, 3], *part[1:])
-            for key, part in meshes.items() for matrix in matrices[key]]
+            for key, part in meshes.items() for matrix in matrices[key]] or elsewhere
 
 
 def _read_part(evaluated: bpy.types.Object, generated: bool, depsgraph: bpy.types.Depsgraph) -> _Part:

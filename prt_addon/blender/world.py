@@ -94,6 +94,23 @@ def read_environment(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph,
     return found if found is not None else _by_cycles(scene, world, output)
 
 
+def needs_cycles(scene: bpy.types.Scene) -> bool:
+    """Whether `read_environment` would have Cycles evaluate the World's nodes, which can't be done within a render."""
+    world = scene.world
+    if world is None or world.node_tree is None or not world.cycles_visibility.diffuse:
+        return False
+    output = world.node_tree.get_output_node("CYCLES")
+    surface = source_of(output.inputs["Surface"]) if output is not None else None
+    if surface is None or surface.bl_idname != "ShaderNodeBackground" or surface.mute:
+        return surface is not None
+    if constant_of(surface.inputs["Strength"]) is None:
+        return True
+    if constant_of(surface.inputs["Color"]) is not None:
+        return False
+    texture = source_of(surface.inputs["Color"])
+    return not _is_plain_hdri(texture) or _lookup_rotation(texture) is None
+
+
 def read_environment_file(path: str) -> EnvironmentSource:
     """An equirectangular .exr or .hdr file in place of the World. Raises PRTError naming the file."""
     path = os.fspath(path)

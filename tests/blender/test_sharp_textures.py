@@ -373,3 +373,19 @@ def test_view_dependent_light_is_no_part_of_the_texture(lit: Any, functions: tup
                                      WIDTH, HEIGHT, samples=1) for used in (textures, None)]
     assert (pictures[0][..., 3] > 0.0).mean() > 0.2
     assert np.abs(pictures[0] - pictures[1]).max() < 2e-3 * pictures[1].max()
+
+
+def test_a_baked_object_that_only_instances_show(lit: Any) -> None:
+    """As after appending or linking its collection: its textures are found where instances place it."""
+    plane = add_plane(image_material("Checker", add_image("checker", checker()))[0])
+    bake_and_store("Plane", spacing=0.3)
+    baked = stored.read_baked(plane)
+    before = image_albedo.surface_textures(plane, baked, depsgraph())
+    collection = bpy.data.collections.new("Instanced")
+    bpy.context.scene.collection.objects.unlink(plane)
+    collection.objects.link(plane)
+    empty = bpy.data.objects.new("Instance", None)
+    empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", collection, (3.0, 1.0, 0.0)
+    bpy.context.scene.collection.objects.link(empty)
+    after = image_albedo.surface_textures(plane, baked, depsgraph())
+    assert after is not None and after.key == before.key

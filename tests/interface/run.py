@@ -33,6 +33,8 @@ SCRIPTS = {
     "faults": ("faults_in_blender.py", "make_scene.py"),
     "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
+    "presets": ("presets_in_blender.py", "make_scene.py"),
+    "compare": ("compare_in_blender.py", "make_scene.py"),
     "views": ("views_in_blender.py", "make_views.py"),
     "changes": ("changes_in_blender.py", "make_views.py"),
     "display": ("display_in_blender.py", "make_display.py"),
