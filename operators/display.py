@@ -24,7 +24,7 @@ from .scene_lamps import cloud_key
 
 RELIT, CLUSTERS, ERROR, VECTORS = "relit", "clusters", "error", "vectors"
 HUES = 12  # tones that neighbours choose from
-UNKNOWN = (0.05, 0.05, 0.05)  # scene-linear, where there is nothing to show
+UNKNOWN = (0.3, 0.3, 0.3)  # scene-linear, where there is nothing to show: no heat, and not the background
 # Of the receivers, how many may be beyond the legend's end: a few bad ones must not make all others dark.
 BEYOND = 0.002
 LEGEND_STEPS = 64
