@@ -25,7 +25,7 @@ from ..gpu_shaders.overlay import Marks
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.image_albedo import surface_textures, textures_key
-from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.read_scene import read_object_triangles, read_triangles
 from ..prt_addon.blender.stored import (
     baked_mesh,
@@ -38,11 +38,13 @@ from ..prt_addon.blender.stored import (
 from ..prt_addon.blender.stored_report import PROPERTY as REPORT_PROPERTY
 from ..prt_addon.blender.stored_report import read_stored_report
 from ..prt_addon.errors import PRTError
+from ..prt_addon.lighting.distant_light import DistantLight
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.moved_light import distant_light_in, is_turned
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.reporting.summary import summary
 from ..prt_addon.scene.surface_textures import SurfaceTextures
+from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
 from .properties import assign, session
@@ -109,7 +111,7 @@ class Live:
     geometry: int = 0  # counts changes of shapes
     around: dict[str, str] = field(default_factory=dict)
     message: str = ""
-    light: NDArray[np.float64] | None = None
+    light: DistantLight | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
@@ -201,8 +203,8 @@ def draw_list() -> list[DrawItem]:
         if found is None or not _is_drawn(found, space):
             continue
         moved = transform_since_bake(found, shown.baked.header, _placed(found, shown.local))
-        light = joined_light(shown.baked.lighting_basis, _light_in(moved),
-                             _live.lamps.cloud_light(shown.baked, shown.moved))
+        basis = shown.baked.lighting_basis
+        light = joined_light(basis, _light_in(basis, moved), _live.lamps.cloud_light(shown.baked, shown.moved))
         painted = colours.get(name)
         items.append(DrawItem(shown.key, shown.baked, moved, light, 1.0 if painted else exposure, shown.stale,
                               direct=shown.direct, colours=painted, textures=shown.textures))
@@ -271,13 +273,13 @@ def _bakes() -> dict[str, BakedTransfer]:
     return {name: shown.baked for name, shown in _live.shown.items()}
 
 
-def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _light_in(basis: Columns, moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Distant light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
     if _live.light is None or not is_turned(moved):
-        return _live.light
-    key = moved[:3, :3].round(6).tobytes()
+        return None if _live.light is None else _live.light.in_columns(basis)
+    key = (basis.cubemap, moved[:3, :3].round(6).tobytes())
     if key not in _live.rotated:
-        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: distant_light_in(_live.light, moved)}
+        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: distant_light_in(_live.light, basis, moved)}
     return _live.rotated[key]
 
 
@@ -436,20 +438,15 @@ def _read_light() -> None:
         _live.signature, _live.light, _live.message = None, None, ""
         return
     started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
-    warnings: list[str] = []
-    order = max(shown.baked.lighting_basis.order for shown in _live.shown.values())
-    distant, signature = None, None
-    if order:
-        name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
-        found = light_coefficients(bpy.context.scene, depsgraph, order, window=bpy.context.scene.prt.window,
-                                   name_lamps=name_lamps)
-        distant, signature = found.coefficients, found.signature
-        warnings += found.warnings
+    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
+    distant, warnings, signature = distant_light(
+        bpy.context.scene, depsgraph, (shown.baked.lighting_basis for shown in _live.shown.values()),
+        window=bpy.context.scene.prt.window, name_lamps=name_lamps)
     _read_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
     _live.message = "\n".join(dict.fromkeys(warnings))
-    if (order, signature) != _live.signature:
-        _live.signature, _live.light, _live.rotated = (order, signature), distant, {}
+    if signature != _live.signature:
+        _live.signature, _live.light, _live.rotated = signature, distant, {}
         viewport.redraw()
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.image_albedo import surface_textures
-from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import BadScene
 from ..prt_addon.relighting.exit_radiance import view_radiance
@@ -63,18 +63,14 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
     scene_lamps: kept by the caller from one light to the next, who tells it when geometry changes.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    order = max(b.lighting_basis.order for b in baked.values())
-    distant, warnings = None, []
-    if order:
-        found = light_coefficients(scene, depsgraph, order, environment, rotate, use_scene_lights, window,
-                                   all(b.cloud is None for b in baked.values()))
-        distant, warnings = found.coefficients, list(found.warnings)
+    distant, warnings, _ = distant_light(scene, depsgraph, (b.lighting_basis for b in baked.values()), environment,
+                                         rotate, use_scene_lights, window, all(b.cloud is None for b in baked.values()))
     moved = {name: transform_since_bake(scene.objects[name], b.header) for name, b in baked.items()}
     scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
     light, direct = {}, {}
     for name, b in baked.items():
-        seen = None if distant is None else distant_light_in(distant, moved[name])
+        seen = distant_light_in(distant, b.lighting_basis, moved[name])
         light[name] = joined_light(b.lighting_basis, seen, scene_lamps.cloud_light(b, moved[name]) if lamps else None)
         direct[name] = scene_lamps.direct(name, b, lamps, moved=moved[name]) if lamps else None
     return Lit(light, direct, moved, tuple(dict.fromkeys(warnings)))
