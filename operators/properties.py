@@ -34,6 +34,15 @@ LAMP_BASIS_ITEMS = (
     ("cloud", "Light Cloud", "Lights of a cloud, between which a lamp is interpolated: a little faster to relight, "
                              "less exact near to surfaces, and without bounced light outside of the cloud", 1),
 )
+DISPLAY_ITEMS = (
+    ("relit", "Light", "The objects as World, Suns and lamps light them", 0),
+    ("clusters", "Clusters", "A colour for each cluster of receivers that share their basis vectors. Costs nothing; "
+                             "the view transform does not touch these colours", 1),
+    ("error", "Error", "How far compression is off at each receiver, relative to the object's mean transfer. Costs "
+                       "nothing, but needs a bake that kept its errors", 2),
+    ("vectors", "Vectors", "How many basis vectors each cluster has. Costs nothing; they differ with the adaptive "
+                           "encoder, or where less is enough", 3),
+)
 LIGHTINGS = {"environment": "environment", "local": "local", "both": "environment,local"}
 GLOSSY_ROWS_ITEMS = (
     ("0", "None", "Only diffuse light: metal is black. The fastest, and the least data", 0),
@@ -142,6 +151,15 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
     )
 
+    display: EnumProperty(
+        name="Show", items=DISPLAY_ITEMS, default="relit", update=_redraw,
+        description="What the preview shows of baked objects: their light, or how they are compressed",
+    )
+    show_cloud: BoolProperty(
+        name="Show Light Cloud", update=_redraw, default=False,
+        description="Marks the lights of the light cloud (grey; merged ones in their zone's colour), or the patches of "
+                    "the surfaces that lamps shine on. Costs some drawing while on, nothing while off",
+    )
     window: BoolProperty(
         name="Soften Ringing", update=_light_changed, default=False,
         description="Takes dark ripples around very bright, small lights away. Costs some of the light's detail, and "
@@ -346,6 +364,7 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
     error_spent: FloatProperty()
+    receiver_errors: BoolProperty()
     stale: StringProperty()
 
 
