@@ -6,6 +6,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from ..prt_addon.blender.fingerprint import RELIT_ATTRIBUTE
 from ..prt_addon.blender.stored import baked_mesh
 from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError, StorageError
@@ -14,7 +15,7 @@ from .arguments import path_of
 from .properties import session
 from .relit import radiance_arrays, read_all, relit
 
-ATTRIBUTE = "PRT Light"
+ATTRIBUTE = RELIT_ATTRIBUTE
 
 
 class PRT_OT_relight(bpy.types.Operator):

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import json
+
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..storage.container import HEADER_PROPERTY
 from ..storage.digests import digest_arrays, digest_json
 from .bake_set import UNKNOWN, pack_place
 from .materials import material_digest
@@ -21,17 +24,23 @@ BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.f
            "BOOLEAN": ("value", 1, np.bool_), "INT16_2D": ("value", 2, np.int32)}
 
 
-def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> str | None:
+RECEIVER_PROPERTY = "prt_receiver"
+RELIT_ATTRIBUTE = "PRT Light"  # the colour attribute of exit radiance that `prt.relight` writes
+
+
+def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
+                    shows_images: bool | None = None) -> str | None:
     """Digest of an object's evaluated geometry in its own space, with all it instances; None if it is not evaluated.
 
     Changes with vertices, faces, sharpness, custom normals, modifiers and the UV maps that its images are seen through,
-    not with the object's place in the world. About 2 ms for 50,000 vertices.
+    not with the object's place in the world. About 2 ms for 50,000 vertices. shows_images: taken instead of what its
+    materials say, where others stand in for them; then through the UV map that renders take.
     """
     evaluated = scene_object.evaluated_get(depsgraph)
     if not evaluated.is_evaluated:
         return None
     parts = [_evaluated_digest(evaluated)] if isinstance(evaluated.data, bpy.types.Mesh) else []
-    parts += _uv_digests(scene_object)
+    parts += _uv_digests(scene_object, shows_images)
     if not _instances_nothing(evaluated):
         to_local = np.linalg.pinv(np.array(scene_object.matrix_world, np.float64))  # small
         cache: dict[int, str] = {}
@@ -78,7 +87,7 @@ def _mesh_digest(mesh: bpy.types.Mesh) -> str:
     return digest_arrays(*arrays, starts)
 
 
-def _uv_digests(scene_object: bpy.types.Object) -> list[str]:
+def _uv_digests(scene_object: bpy.types.Object, shows_images: bool | None) -> list[str]:
     """Digests of the UV maps through which the object's materials may show images; none without images.
 
     Of the object's own mesh: the evaluated one keeps UV maps only while something that is drawn asks for them.
@@ -87,7 +96,9 @@ def _uv_digests(scene_object: bpy.types.Object) -> list[str]:
     if not isinstance(mesh, bpy.types.Mesh) or not mesh.uv_layers:
         return []
     nodes = [node for material in dict.fromkeys(used_materials(scene_object)) for node in _nodes_of(material)]
-    if not any(getattr(node, "image", None) is not None for node in nodes):
+    if shows_images is None:
+        shows_images = any(getattr(node, "image", None) is not None for node in nodes)
+    if not shows_images:
         return []
     shown = {node.uv_map for node in nodes if hasattr(node, "uv_map")} | {
         node.attribute_name for node in nodes if node.bl_idname == "ShaderNodeAttribute"}
@@ -106,6 +117,12 @@ def _nodes_of(material: bpy.types.Material | None) -> list[bpy.types.Node]:
     return [] if output is None else list(reachable(output))
 
 
+def shows_relit(scene_object: bpy.types.Object) -> bool:
+    """Whether one of an object's materials shows the light that its bake gave: it stands in for one that was baked."""
+    return any(RELIT_ATTRIBUTE in (getattr(node, "layer_name", None), getattr(node, "attribute_name", None))
+               for material in dict.fromkeys(used_materials(scene_object)) for node in _nodes_of(material))
+
+
 def used_materials(scene_object: bpy.types.Object) -> list[bpy.types.Material | None]:
     """The materials in an object's slots."""
     return [slot.material for slot in scene_object.material_slots]
@@ -113,8 +130,25 @@ def used_materials(scene_object: bpy.types.Object) -> list[bpy.types.Material | 
 
 def fingerprint(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[str, str | None]:
     """Digests of an object's geometry and materials, to take when it is read and to hand to `write_baked`."""
-    return {"geometry": geometry_digest(scene_object, depsgraph),
-            "materials": material_digest(used_materials(scene_object))}
+    return {"geometry": geometry_digest(scene_object, depsgraph), "materials": materials_as_baked(scene_object)}
+
+
+def materials_as_baked(scene_object: bpy.types.Object) -> str:
+    """Digest of an object's materials; where they only show what its bake gave, of those that it was baked with."""
+    then = _materials_at_bake(scene_object) if shows_relit(scene_object) else None
+    return then or material_digest(used_materials(scene_object))
+
+
+def _materials_at_bake(scene_object: bpy.types.Object) -> str | None:
+    """As its bake's header tells; None without a bake that can be read."""
+    for mesh in (scene_object.original.get(RECEIVER_PROPERTY), scene_object.original.data):
+        header = mesh.get(HEADER_PROPERTY) if isinstance(mesh, bpy.types.Mesh) else None
+        if header is not None:
+            try:
+                return json.loads(header)["digests"]["materials"]
+            except (TypeError, ValueError, KeyError):
+                return None
+    return None
 
 
 def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
@@ -156,7 +190,7 @@ def _shape_digest(mesh: str, source: bpy.types.Object, place: NDArray[np.float64
     """Of a mesh with the materials of the object that shows it; with its size where that counts: light travels through
     bodies by a length of its own."""
     materials = used_materials(source)
-    parts = [mesh, material_digest(materials), source.visible_shadow, source.visible_diffuse]
+    parts = [mesh, materials_as_baked(source), source.visible_shadow, source.visible_diffuse]
     if any(_is_translucent(node) for material in dict.fromkeys(materials) for node in _nodes_of(material)):
         volume = np.linalg.det(place[:3, :3])  # small
         parts.append(f"{abs(volume) ** (1.0 / 3.0):.4g}")

@@ -25,11 +25,10 @@ from ..storage import container
 from ..storage.container import BakedTransfer
 from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
 from .bake_set import changed_piece
-from .fingerprint import fingerprint, geometry_digest, material_digest, used_materials
+from .fingerprint import RECEIVER_PROPERTY, fingerprint, geometry_digest, materials_as_baked, shows_relit
 from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
 NORMAL_ATTRIBUTE, TANGENT_ATTRIBUTE = "prt_normal", "prt_tangent"
-RECEIVER_PROPERTY = "prt_receiver"
 CARRIER_PROPERTY = "prt_carrier"  # on the object that carries a receiver mesh
 RECEIVER_NAME = "PRT {}"
 MOVED = "it was moved, turned or scaled since the bake, and not all that is around it came along"
@@ -185,10 +184,12 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     if header is None:
         return None
     digests = _stored_digests(header, scene_object.name)
-    geometry = geometry_digest(scene_object, depsgraph)
-    if geometry is not None and digests.get("geometry") != geometry:
+    # A material that shows the relit colours says nothing about the images of the ones that were baked.
+    images = (False, True) if shows_relit(scene_object) else (None,)
+    geometry = [geometry_digest(scene_object, depsgraph, shown) for shown in images]
+    if geometry[0] is not None and digests.get("geometry") not in geometry:
         return "its mesh or modifiers changed since the bake"
-    if digests.get("materials") != material_digest(used_materials(scene_object)):
+    if digests.get("materials") != materials_as_baked(scene_object):
         return "its materials changed since the bake"
     moved, then = transform_since_bake(scene_object, header, matrix), digests.get("surroundings")
     stays = np.array_equal(moved, np.eye(4))
