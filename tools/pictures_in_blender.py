@@ -78,6 +78,9 @@ def set_up() -> Step:
     with override():
         bpy.ops.view3d.view_center_camera()
     yield 1.0
+    sys.modules[MODULE].PRT_PT_last_bake.bl_options = set()  # open from the first time that it is drawn
+    only()
+    yield 1.0
     region("UI").active_panel_category = "PRT"
     select()
     yield 1.0
