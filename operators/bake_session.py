@@ -321,5 +321,6 @@ def baked_message(result: BakeResult, seconds: float) -> str:
             if key == "local_errors" or report["settings"]["lighting"] == "local":
                 return f"{text}, mostly because lamps are put together from few columns"
             subject = "" if part == "diffuse" else ", in highlights"
-            return f"{text}, mostly because the light is sharper than the order can show{subject}"
+            limit = "cubemap" if report["settings"].get("distant_basis") == "cubemap" else "order"
+            return f"{text}, mostly because the light is sharper than the {limit} can show{subject}"
     return text
