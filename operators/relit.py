@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
+from ..prt_addon.blender.image_albedo import surface_textures
 from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.blender.visibility import find_objects
@@ -97,5 +98,7 @@ def draw_lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], lit: Lit, 
     from ..gpu_shaders import offscreen  # a machine without a graphics driver can do all else
     from ..gpu_shaders.render_data import DrawItem
 
-    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name]) for name, b in baked.items()]
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name],
+                      textures=surface_textures(scene.objects[name], b, depsgraph)) for name, b in baked.items()]
     return offscreen.draw_items(scene, items, width, height, background, samples)
