@@ -18,6 +18,7 @@ import bpy
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "interface"))
 from driving import (  # its path is known only now
     DRAWN,
+    MODULE,
     OUTPUT,
     SCENE,
     Step,
@@ -43,8 +44,8 @@ def picture(name: str, *options: str, source: str = "") -> None:
     if not source:
         shoot(name)
     SHOWN.mkdir(exist_ok=True)
-    subprocess.run(["convert", str(OUTPUT / f"{source or name}.png"), *options, "-strip", "-colors", "256",
-                    f"PNG8:{SHOWN / name}.png"], check=True, timeout=60)
+    subprocess.run(["convert", str(OUTPUT / f"{source or name}.png"), *options, "-strip", str(SHOWN / f"{name}.png")],
+                   check=True, timeout=60)
 
 
 def crop(kind: str = "UI", top: int = 0, height: int = 0) -> tuple[str, ...]:
@@ -53,16 +54,15 @@ def crop(kind: str = "UI", top: int = 0, height: int = 0) -> tuple[str, ...]:
     return "-crop", f"{box.width}x{height or box.height}+{box.x}+{HEIGHT - box.y - box.height + top}", "+repage"
 
 
-def fold(*opened: str) -> None:
-    """Only these panels of the tab open; scripts can't fold panels, a drag over their headers can: so ask for the tab
-    anew, with the others' categories moved away."""
-    for name in dir(bpy.types):
-        panel = getattr(bpy.types, name)
-        if name.startswith("PRT_PT_") and getattr(panel, "bl_category", "") in ("PRT", "Hidden PRT") and not hasattr(
-                panel, "bl_parent_id"):
-            bpy.utils.unregister_class(panel)
-            panel.bl_category = "PRT" if name in opened else "Hidden PRT"
-            bpy.utils.register_class(panel)
+def only(*wanted: str) -> None:
+    """Only these panels in the sidebar, in order; none named: all. Scripts can't fold panels."""
+    panels = [cls for cls in sys.modules[MODULE].CLASSES if issubclass(cls, bpy.types.Panel)]
+    for cls in reversed(panels):
+        if cls.is_registered:
+            bpy.utils.unregister_class(cls)
+    for cls in panels:
+        if not wanted or cls.__name__ in wanted:
+            bpy.utils.register_class(cls)
 
 
 def set_up() -> Step:
@@ -77,6 +77,9 @@ def set_up() -> Step:
     bpy.context.scene.camera.data.passepartout_alpha = 1.0
     with override():
         bpy.ops.view3d.view_center_camera()
+    yield 1.0
+    sys.modules[MODULE].PRT_PT_last_bake.bl_options = set()  # open from the first time that it is drawn
+    only()
     yield 1.0
     region("UI").active_panel_category = "PRT"
     select()
@@ -97,7 +100,7 @@ def bake() -> Step:
     bpy.context.scene.prt.preset = "standard"
     assert invoke_bake() == {"RUNNING_MODAL"}
     yield from wait_for_bake("baking")
-    picture("progress", *crop(height=330), source="baking")
+    picture("progress", *crop(height=400), source="baking")
     assert not session().failed, session().message
     yield from until(lambda: session().objects, "nothing is listed")
     with override():
@@ -131,15 +134,15 @@ def presets() -> Step:
         with override():
             assert bpy.ops.prt.light_preset_add(name=name) == {"FINISHED"}
         yield 1.0
-    fold("PRT_PT_light_presets")
+    only("PRT_PT_light_presets", "PRT_PT_lights", "PRT_PT_light_animation")
     yield DRAWN
-    region("UI").active_panel_category = "PRT"
-    yield DRAWN
-    picture("presets", *crop(height=520))
+    picture("presets", *crop(height=600))
     mapping.inputs["Rotation"].default_value[2] = 0.0
-    fold("PRT_PT_results")
+    only("PRT_PT_results", "PRT_PT_last_bake")
     yield DRAWN
-    picture("results", *crop(height=560))
+    picture("results", *crop(height=700))
+    only()
+    yield DRAWN
 
 
 def drag_a_lamp() -> Step:

@@ -569,9 +569,10 @@ class _Bake:
         keys = choose_receivers(self.open_keys[self.glossy[self.open_keys]], self.settings.error_receivers,
                                 self.settings.seed)
         if len(keys):
+            functions, columns = glossy.rows.shape[1:3]  # columns of lamps may follow those of distant light
             before = np.concatenate([signals[t.name][keys[(keys >= t.points.start) & (keys < t.points.stop)]
-                                                     - t.points.start, 1:] for t in self.targets
-                                     if signals[t.name].shape[1] == 1 + glossy.rows.shape[1]])
+                                                     - t.points.start, 1:, :columns] for t in self.targets
+                                     if signals[t.name].shape[1] == 1 + functions])
             self.highlights = keys, glossy.at(keys), before
 
     def _choose_local_highlights(self, local: LocalTransfer | None, signals: dict[str, NDArray[np.float32]]) -> None:

@@ -199,9 +199,9 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
         return None
     try:
         changed = changed_piece(then, surroundings, moved)
-        if stays and changed == scene_object.name_full:  # of itself more has been asked above
-            changed = changed_piece(*({name: entry for name, entry in entries.items() if name != changed}
-                                      for entries in (then, surroundings)), moved)
+        if stays and changed == scene_object.name_full and changed not in surroundings:  # hidden in renders itself
+            changed = changed_piece({name: entry for name, entry in then.items() if name != changed}, surroundings,
+                                    moved)
     except ValueError as error:
         raise StorageError(scene_object.name, f"the header of its baked data states no valid digests ({error})",
                            container.REBAKE) from error

@@ -33,7 +33,7 @@ from driving import (
     until,
     window,
 )
-from long_bakes import LONG, MIDDLE, QUICK, bake, ended, header, jobs, jobs_folder, under_way
+from long_bakes import LONG, MIDDLE, bake, ended, header, jobs, jobs_folder, under_way
 
 
 def open_scene() -> Step:
@@ -63,18 +63,25 @@ def fill_disk() -> Step:
     assert not children() and header("Statue") == before and not [p for j in jobs() for p in j.glob(".*.part")]
     yield DRAWN
     shoot("q05_full")
+    stages = LONG + ", order=7, spacing=0.03, gather_directions=128"
+    bake("Statue", overrides=stages)
+    yield from under_way()
+    written = max(jobs(), key=lambda folder: folder.stat().st_mtime)
+    scene, gathered = ((written / name).stat().st_size // 1024 for name in ("scene.npz", "gather.npz"))
+    bpy.ops.prt.cancel()
+    yield from ended()
     folder = jobs_folder()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(folder)], check=False).returncode:
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)], check=False).returncode:
         print("no small disk can be mounted here: left out", flush=True)
         return
     try:
-        for kilobytes in (100, 300, 600):
+        for kilobytes, stage in ((scene + 64, "gather.npz"), (scene + gathered + 64, "direct.npz")):
             subprocess.run(["mount", "-o", f"remount,size={kilobytes}k", str(folder)], check=True)
-            bake("Statue", overrides=QUICK + ", directions=2048, order=7, spacing=0.03")
-            yield from until(lambda: not session().running, "the bake goes on without a disk", 60.0)
-            print(f"{kilobytes} kB: {session().message}", flush=True)
-            assert session().failed and "pace" in session().message, session().message
-            assert not children() and header("Statue") == before
+            bake("Statue", overrides=stages)
+            yield from ended()
+            assert session().failed and f"{stage}: can't be written" in session().message, session().message
+            assert "pace" in session().message and not children() and header("Statue") == before
+            assert not [path for job in jobs() for path in job.glob(".*.part")]
     finally:
         subprocess.run(["umount", str(folder)], check=True)
 
