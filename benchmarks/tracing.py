@@ -24,7 +24,7 @@ from prt_addon.baking.settings import BakeSettings
 from prt_addon.basis.directions import quadrature
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.tracing.tracer import Tracer
-from prt_addon.transport.direct import CHUNK, _cosine_visibility, direct_transfer
+from prt_addon.transport.direct import CHUNK, cosine_visibility, direct_transfer
 from prt_addon.transport.receiver_set import ReceiverSet, blocks
 
 
@@ -51,7 +51,7 @@ def trace_only(tracer: Tracer, receivers: ReceiverSet, directions: np.ndarray) -
     single = directions.astype(np.float32)
     tasks = ((block.receivers, single[start:start + CHUNK]) for block in blocks(len(receivers), 0, 0)
              for start in range(0, len(single), CHUNK))
-    for _ in tracer.map_in_order(lambda task: _cosine_visibility(tracer, receivers, *task), tasks):
+    for _ in tracer.map_in_order(lambda task: cosine_visibility(tracer, receivers, *task), tasks):
         pass
 
 

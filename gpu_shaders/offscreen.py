@@ -8,6 +8,7 @@ transform is applied by `write_png`, through Blender's own saving of renders.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import subprocess
@@ -25,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..prt_addon.errors import BadArguments, BadScene, PRTError
 from ..prt_addon.lighting.environment import pixel_of_direction
 from ..prt_addon.storage.files import write_atomically
+from . import programs
 from .draw import DrawingCache, read_texture
 from .render_data import LARGEST_TEXTURE, DrawItem
 
@@ -51,6 +53,7 @@ def prepare_gpu() -> None:
             "Install OpenGL or Vulkan drivers (on Linux Mesa with libEGL), or use `relight`, which needs none",
         )
     gpu.init()
+    atexit.register(programs.release)  # a script's sys.exit ends Python after Blender's GPU module, which crashes
 
 
 def _probe_command() -> list[str]:
@@ -265,6 +268,8 @@ def _png_settings(scene: bpy.types.Scene, color_mode: str) -> Iterator[None]:
         "color_management": "FOLLOW_SCENE",
     }
     before = {name: getattr(settings, name) for name in wanted if hasattr(settings, name)}
+    # Blender sets it along with the format; of some formats it has none, and warns of asking for it.
+    space = "" if settings.file_format == "PNG" else settings.linear_colorspace_settings.name
     try:
         for name in before:
             setattr(settings, name, wanted[name])
@@ -272,3 +277,5 @@ def _png_settings(scene: bpy.types.Scene, color_mode: str) -> Iterator[None]:
     finally:
         for name, value in before.items():
             setattr(settings, name, value)
+        if space:
+            settings.linear_colorspace_settings.name = space

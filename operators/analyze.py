@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.baking.settings import make_settings
 from ..prt_addon.errors import PRTError
-from .bake_session import analysis_lines, analyze_scene, chosen_targets
+from .arguments import settings_of, targets_of
+from .bake_session import analysis_lines, analyze_scene
 from .properties import assign, session
 
 
@@ -16,6 +16,11 @@ class PRT_OT_analyze(bpy.types.Operator):
 
     bl_idname = "prt.analyze"
     bl_label = "Analyze"
+
+    preset: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}, description="As of prt.bake")
+    lighting: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}, description="As of prt.bake")
+    objects: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}, description="As of prt.bake")
+    overrides: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}, description="As of prt.bake")
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -26,8 +31,9 @@ class PRT_OT_analyze(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            settings = make_settings(context.scene.prt.preset, context.scene.prt.overrides())
-            analysis = analyze_scene(context.evaluated_depsgraph_get(), settings, chosen_targets(context.scene))
+            settings = settings_of(context.scene, self.preset, self.lighting, self.overrides)
+            analysis = analyze_scene(context.evaluated_depsgraph_get(), settings,
+                                     targets_of(context.scene, self.objects))
         except PRTError as error:
             assign(session(context), analysis="", message=str(error), failed=True)
             self.report({"ERROR"}, str(error))

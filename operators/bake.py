@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.baking.settings import make_settings, parse_overrides
+from .arguments import settings_of, targets_of
 from .bake_request import BakeRequest
-from .bake_session import chosen_targets
 from .job_mixin import JobMixin
 
 
@@ -21,6 +20,18 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
     bl_label = "Bake Light Transfer"
     bl_options = {"UNDO"}
 
+    preset: bpy.props.StringProperty(
+        name="Preset", options={"HIDDEN", "SKIP_SAVE"},
+        description="draft, standard or high, in place of all of the panel's settings; empty takes the panel's",
+    )
+    lighting: bpy.props.StringProperty(
+        name="Lighting", options={"HIDDEN", "SKIP_SAVE"},
+        description="environment, local or environment,local; empty takes the panel's",
+    )
+    objects: bpy.props.StringProperty(
+        name="Objects", options={"HIDDEN", "SKIP_SAVE"},
+        description="Names of the objects to bake, with commas between; empty takes those that the panel says",
+    )
     overrides: bpy.props.StringProperty(
         name="Overrides", options={"HIDDEN", "SKIP_SAVE"},
         description="Any setting by name, as --set of the command line takes it: \"directions=4096, vectors=12\". "
@@ -38,10 +49,9 @@ class PRT_OT_bake(JobMixin, bpy.types.Operator):
         return True
 
     def make_request(self, context: bpy.types.Context) -> BakeRequest:
-        """The selection or collection, and the settings, of now."""
-        settings = make_settings(context.scene.prt.preset,
-                                 context.scene.prt.overrides() | parse_overrides(self.overrides))
-        return BakeRequest.of_choice(context, settings, chosen_targets(context.scene))
+        """The selection or collection, and the settings, of now, or those that the arguments name."""
+        settings = settings_of(context.scene, self.preset, self.lighting, self.overrides)
+        return BakeRequest.of_choice(context, settings, targets_of(context.scene, self.objects))
 
 
 class PRT_OT_follow_bakes(JobMixin, bpy.types.Operator):

@@ -45,7 +45,7 @@ class BakeRequest:
         present = {o.name_full: o.session_uid for o in context.scene.objects}
         missing = [name for name in asked or () if name not in present]
         if missing:
-            raise BadScene(missing[0], "it is not in this scene", "Choose another collection")
+            raise BadScene(missing[0], "it is not in this scene", "Check the name, or choose another collection")
         return BakeRequest(title_of(names if asked is None else asked), Place.of(context), settings,
                            {name: present[name] for name in names},
                            None if asked is None else {name: present[name] for name in asked})

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 import numpy as np
@@ -34,6 +34,7 @@ from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
 from ..prt_addon.blender.read_scene import read_objects, selected_names
 from ..prt_addon.blender.stored import stale, write_baked
+from ..prt_addon.blender.stored_report import store_report
 from ..prt_addon.blender.visibility import find_objects, render_visible_objects
 from ..prt_addon.errors import BadScene, StorageError
 from ..prt_addon.lighting.light_cloud import free_space
@@ -140,6 +141,7 @@ class BakeSession:
     surroundings: dict[str, str]
     identities: dict[str, int]
     notes: list[str] = field(default_factory=list)
+    writes_bakes: ClassVar[bool] = True
 
     @staticmethod
     def start(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: Sequence[str] | None,
@@ -216,6 +218,7 @@ class BakeSession:
         for name, target in found.items():
             if target is not None:
                 write_baked(target, result.objects[name], self.digests[name], self.surroundings)
+        store_report(self.scene.find(), result.report)
         self.notes += [f"{name} was deleted meanwhile, and its bake dropped" for name in gone]
         return replace(result, objects={name: baked for name, baked in result.objects.items() if name not in gone})
 
@@ -238,6 +241,14 @@ class BakeSession:
         """A target that can't be written now, because it is in edit mode or being sculpted or painted."""
         return next((target.name for target in self.targets().values()
                      if target is not None and target.mode != "OBJECT"), None)
+
+    def conclude(self) -> str:
+        """`store` the result and leave nothing else; what to tell the user, beside `notes`. Raises PRTError."""
+        result = self.store()
+        self.note_changes()
+        self.discard()
+        self.close()
+        return baked_message(result, self.seconds)
 
     def discard(self) -> None:
         """Drop the job folder."""
@@ -309,5 +320,6 @@ def baked_message(result: BakeResult, seconds: float) -> str:
             if key == "local_errors" or report["settings"]["lighting"] == "local":
                 return f"{text}, mostly because lamps are put together from few columns"
             subject = "" if part == "diffuse" else ", in highlights"
-            return f"{text}, mostly because the light is sharper than the order can show{subject}"
+            limit = "cubemap" if report["settings"].get("distant_basis") == "cubemap" else "order"
+            return f"{text}, mostly because the light is sharper than the {limit} can show{subject}"
     return text

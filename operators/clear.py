@@ -6,8 +6,11 @@ from __future__ import annotations
 import bpy
 
 from ..prt_addon.blender.stored import baked_objects, clear_baked, clear_orphans
+from ..prt_addon.blender.stored_report import clear_report
+from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError
 from . import live_preview
+from .arguments import names_of
 from .properties import assign, session
 
 
@@ -18,6 +21,11 @@ class PRT_OT_clear(bpy.types.Operator):
     bl_idname = "prt.clear"
     bl_label = "Clear Bake"
     bl_options = {"UNDO"}
+
+    objects: bpy.props.StringProperty(
+        name="Objects", options={"HIDDEN", "SKIP_SAVE"},
+        description="Names of the objects to clear, with commas between; empty takes the selection",
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -32,9 +40,12 @@ class PRT_OT_clear(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             baked = baked_objects(context.scene)
-            chosen = [o for o in baked if o.select_get()] or baked
+            named = find_objects(names_of(self.objects), context.scene) if self.objects else None
+            chosen = [o for o in baked if (o in named if named else o.select_get())] or ([] if named else baked)
             for baked_object in chosen:
                 clear_baked(baked_object)
+            if len(chosen) == len(baked):
+                clear_report(context.scene)
             if chosen is baked:
                 clear_orphans(context.scene)
         except PRTError as error:

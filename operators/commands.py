@@ -22,6 +22,7 @@ import bpy
 from ..prt_addon.baking.settings import PRESETS
 from ..prt_addon.errors import BadArguments, Cancelled, PRTError
 from . import verbs
+from .arguments import lighting_of, names_of, size_of
 
 COMMAND = "prt"
 
@@ -100,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_preview(verb)
     _add_report(verb)
     _add_export(verb)
+    _add_compare(verb)
     return parser
 
 
@@ -111,9 +113,9 @@ def _verb(verbs_group: argparse._SubParsersAction, name: str, text: str) -> argp
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--input", type=Path, required=True, metavar="FILE.blend")
-    parser.add_argument("--objects", type=_names, default=None, metavar="A,B", help="default: all visible meshes")
+    parser.add_argument("--objects", type=names_of, default=None, metavar="A,B", help="default: all visible meshes")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="standard")
-    parser.add_argument("--lighting", type=_lighting, default=None, metavar="environment,local",
+    parser.add_argument("--lighting", type=lighting_of, default=None, metavar="environment,local",
                         help="what will light the scene: World and Suns, lamps that move, or both")
     parser.add_argument("--set", type=_assignment, action="append", default=[], dest="overrides", metavar="NAME=VALUE",
                         help="a single setting, in place of the preset's; may be repeated")
@@ -152,7 +154,7 @@ def _add_preview(group: argparse._SubParsersAction) -> None:
     parser = _verb(group, "preview", "Draw the active camera's view of a baked scene.")
     parser.add_argument("--input", type=Path, required=True, metavar="FILE.blend")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.png")
-    parser.add_argument("--size", type=_size, default=None, metavar="WxH", help="default: the scene's resolution")
+    parser.add_argument("--size", type=size_of, default=None, metavar="WxH", help="default: the scene's resolution")
     _add_light_options(parser)
 
 
@@ -168,19 +170,13 @@ def _add_export(group: argparse._SubParsersAction) -> None:
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER")
 
 
-def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if not names:
-        raise argparse.ArgumentTypeError("no object names given")
-    return names
-
-
-def _lighting(text: str) -> str:
-    kinds = {kind.strip() for kind in text.split(",")}
-    chosen = [kind for kind in ("environment", "local") if kind in kinds]
-    if len(chosen) != len(kinds):
-        raise argparse.ArgumentTypeError(f"{text!r} is not environment, local or environment,local")
-    return ",".join(chosen)
+def _add_compare(group: argparse._SubParsersAction) -> None:
+    parser = _verb(group, "compare", "Render the camera's view with Cycles, and compare the preview with it.")
+    parser.add_argument("--input", type=Path, required=True, metavar="FILE.blend")
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE.png")
+    parser.add_argument("--samples", type=int, default=64, help="of Cycles in each pixel; default: 64")
+    parser.add_argument("--size", type=size_of, default=None, metavar="WxH", help="default: the scene's resolution")
+    parser.add_argument("--report", type=Path, default=None, metavar="FILE.json", help="where the numbers go")
 
 
 def _assignment(text: str) -> tuple[str, str]:
@@ -188,13 +184,6 @@ def _assignment(text: str) -> tuple[str, str]:
     if not (name and equals):
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
     return name.strip(), value.strip()
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT in pixels")
-    return int(width), int(height)
 
 
 _registered: list[object] = []

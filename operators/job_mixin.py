@@ -17,9 +17,12 @@ from ..prt_addon.baking.record import CANCELLED, FAILED
 from ..prt_addon.errors import Cancelled, PRTError
 from . import live_preview
 from .bake_request import BakeRequest
-from .bake_session import BakeSession, baked_message
+from .bake_session import BakeSession
+from .compare_session import CompareRequest, CompareSession
 from .properties import assign, session
 
+Request = BakeRequest | CompareRequest
+Job = BakeSession | CompareSession
 POLL_SECONDS = 0.2  # each tick redraws the sidebar
 ENDED_LINES = 6  # of earlier bakes of a queue that the panel shows
 
@@ -35,6 +38,7 @@ STAGES = {
     "subsurface": "Light through bodies",
     "encode": "Compressing",
     "errors": "Measuring the error",
+    "cycles": "Rendering with Cycles",
 }
 
 
@@ -45,16 +49,17 @@ def progress_text(message: Message) -> str:
 
 
 class JobMixin:
-    """Base of operators that bake. A subclass gives `make_request(context) -> BakeRequest`, which raises PRTError.
+    """Base of operators that bake, or compare with Cycles. A subclass gives `make_request(context) -> Request`, which
+    raises PRTError.
 
     The state is on the class, because Blender makes a new operator instance per call, and any of them may follow the
     queue: `active` while one does.
     """
 
     active: ClassVar[bool] = False
-    running: ClassVar[BakeSession | None] = None
+    running: ClassVar[Job | None] = None
     title: ClassVar[str] = ""
-    waiting: ClassVar[list[BakeRequest]] = []
+    waiting: ClassVar[list[Request]] = []
     cancel_requested: ClassVar[bool] = False
     timer: ClassVar[bpy.types.Timer | None] = None
     status_shown: ClassVar[set[str]] = set()  # workspaces whose status bar shows our text
@@ -117,7 +122,7 @@ class JobMixin:
         JobMixin.waiting.append(request)
         if JobMixin.active:
             _show_waiting()
-            self.report({"INFO"}, f"{request.title}: baked after what is under way")
+            self.report({"INFO"}, f"{request.title}: its turn comes after what is under way")
             return {"INTERFACE"}  # nothing has changed that could be undone
         assign(session(context), ended="")
         JobMixin.cancel_requested = False
@@ -184,7 +189,7 @@ class JobMixin:
                     self._fail(error)
         return False
 
-    def _begin(self, context: bpy.types.Context, request: BakeRequest) -> None:
+    def _begin(self, context: bpy.types.Context, request: Request) -> None:
         """Start a bake; what the one before it left as a message moves up."""
         state = session(context)
         ended = state.ended
@@ -201,7 +206,7 @@ class JobMixin:
         job = JobMixin.running
         try:
             if JobMixin.cancel_requested:
-                raise Cancelled("Bake", "cancelled, nothing was changed", "Bake again to resume where it stopped")
+                raise Cancelled(job.process.subject, "cancelled, nothing was changed", job.process.cancel_remedy)
             for message in job.process.poll()[-1:]:  # the last says it all: it alone can be an end
                 self._show(context, message)
             if not job.process.finished:
@@ -214,7 +219,7 @@ class JobMixin:
                 return
             self._complete(context, job)
             if JobMixin.waiting:  # after the last one Blender does it
-                bpy.ops.ed.undo_push(message=f"Bake {JobMixin.title}")
+                bpy.ops.ed.undo_push(message=f"Bake {JobMixin.title}" if job.writes_bakes else JobMixin.title)
                 self.stored = False
         except PRTError as error:
             self._fail(error)
@@ -246,15 +251,12 @@ class JobMixin:
         context.workspace.status_text_set(f"PRT: {text} ({more})")
         JobMixin.status_shown.add(context.workspace.name)
 
-    def _complete(self, context: bpy.types.Context, job: BakeSession) -> None:
+    def _complete(self, context: bpy.types.Context, job: Job) -> None:
         """Store a finished bake and say what came out."""
-        result = job.store()
-        job.note_changes()
-        job.discard()
-        job.close()
+        text = ". ".join([job.conclude(), *job.notes])
         self.stored = True
-        live_preview.bakes_changed()
-        text = ". ".join([baked_message(result, job.seconds), *job.notes])
+        if job.writes_bakes:
+            live_preview.bakes_changed()
         assign(session(context), message=text, failed=False)
         self.report({"WARNING" if job.notes else "INFO"}, text)
 

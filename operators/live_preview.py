@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from typing import ClassVar
 
 import bpy
@@ -23,13 +23,25 @@ from ..gpu_shaders import viewport
 from ..gpu_shaders.occluders import Occluder
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.read_scene import read_object_triangles, read_triangles
-from ..prt_addon.blender.stored import baked_mesh, baked_objects, read_baked, stale, transform_since_bake
+from ..prt_addon.blender.stored import (
+    baked_mesh,
+    baked_objects,
+    is_receiver,
+    read_baked,
+    stale,
+    transform_since_bake,
+)
+from ..prt_addon.blender.stored_report import PROPERTY as REPORT_PROPERTY
+from ..prt_addon.blender.stored_report import read_stored_report
 from ..prt_addon.errors import PRTError
+from ..prt_addon.lighting.distant_light import DistantLight
 from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.moved_light import distant_light_in, is_turned
 from ..prt_addon.relighting.scene_light import joined_light
+from ..prt_addon.reporting.summary import summary
+from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
@@ -51,11 +63,14 @@ LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.Node
 class Shown:
     """One baked object as it was read; the rest of its DrawItem is looked up on every redraw.
 
-    moved: (4, 4) since its bake, while all that is around it came along; None where the bake is stale.
+    moved: (4, 4) since its bake, while all that is around it came along; None where the bake is stale. owner: full name
+    of the scene's object that shows it; local: (4, 4), where it stands relative to that if it is an instance.
     """
 
     baked: BakedTransfer
     key: Hashable
+    owner: str
+    local: NDArray[np.float64] | None = None
     stale: bool = False
     direct: NDArray[np.float32] | None = None
     moved: NDArray[np.float64] | None = None
@@ -84,11 +99,12 @@ class Live:
 
     shown: dict[str, Shown] = field(default_factory=dict)
     lines: list[Line] = field(default_factory=list)
+    owners: set[str] = field(default_factory=set)
     known: Hashable = None
     geometry: int = 0  # counts changes of shapes
     around: dict[str, str] = field(default_factory=dict)
     message: str = ""
-    light: NDArray[np.float64] | None = None
+    light: DistantLight | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
@@ -171,20 +187,25 @@ def draw_list() -> list[DrawItem]:
     if _live.signature is None:
         return []
     space, exposure = bpy.context.space_data, 2.0 ** bpy.context.scene.prt.exposure
-    items, present = [], 0
-    for found in bpy.context.view_layer.objects:
-        shown = _live.shown.get(found.name_full)
-        present += shown is not None
-        if shown is None or not _is_drawn(found, space):
+    items, owners = [], {name: found for found in bpy.context.view_layer.objects
+                         if (name := found.name_full) in _live.owners}
+    for shown in _live.shown.values():
+        found = owners.get(shown.owner)
+        if found is None or not _is_drawn(found, space):
             continue
-        moved = transform_since_bake(found, shown.baked.header)
-        light = joined_light(shown.baked.lighting_basis, _light_in(moved),
-                             _live.lamps.cloud_light(shown.baked, shown.moved))
+        moved = transform_since_bake(found, shown.baked.header, _placed(found, shown.local))
+        basis = shown.baked.lighting_basis
+        light = joined_light(basis, _light_in(basis, moved), _live.lamps.cloud_light(shown.baked, shown.moved))
         items.append(DrawItem(shown.key, shown.baked, moved, light, exposure, shown.stale, direct=shown.direct))
-    if present < len(_live.shown):  # one was renamed or removed, which Blender may not tell
+    if len(owners) < len(_live.owners):  # one was renamed or removed, which Blender may not tell
         _live.bakes_dirty = True
         _schedule(SHORTEST_WAIT)
     return items
+
+
+def _placed(owner: bpy.types.Object, local: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Where an instance stands now; None for an object of the scene itself."""
+    return None if local is None else np.array(owner.matrix_world, np.float64) @ local  # small
 
 
 def _is_drawn(found: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
@@ -207,12 +228,15 @@ def shows_everything() -> bool:
 def occluders() -> list[Occluder]:
     """All meshes that this region shows and we do not draw: they may stand in front of those that we draw."""
     space, depsgraph = bpy.context.space_data, bpy.context.view_layer.depsgraph
-    found, lit = [], {name for name in _live.shown if (known := bpy.context.view_layer.objects.get(name)) is not None
-                      and _is_drawn(known, space)}
+    owners = bpy.context.view_layer.objects
+    lit = {name for name, shown in _live.shown.items()
+           if (owner := owners.get(shown.owner)) is not None and _is_drawn(owner, space)}
+    found = []
     for instance in depsgraph.object_instances if depsgraph is not None else ():
         source = instance.object
         owner = (instance.parent if instance.is_instance else source).original
-        if owner.name_full in lit or not isinstance(source.data, bpy.types.Mesh) or not instance.show_self or (
+        names = {owner.name_full, f"{owner.name_full}/{source.original.name_full}"}
+        if names & lit or not isinstance(source.data, bpy.types.Mesh) or not instance.show_self or (
                 owner.display_type in OUTLINES or not owner.visible_in_viewport_get(space)):
             continue
         key = source.data.as_pointer(), _live.geometry
@@ -228,30 +252,51 @@ def labels() -> list[tuple[str, tuple[float, ...]]]:
     return [(OUTSIDE_LABEL, tuple(lamp.position)) for lamp in _live.lamps_read if lamp.name in outside]
 
 
-def _light_in(moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _light_in(basis: Columns, moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Distant light as a moved object sees it: its bake turns with the object, so the light turns the other way."""
     if _live.light is None or not is_turned(moved):
-        return _live.light
-    key = moved[:3, :3].round(6).tobytes()
+        return None if _live.light is None else _live.light.in_columns(basis)
+    key = (basis.cubemap, moved[:3, :3].round(6).tobytes())
     if key not in _live.rotated:
-        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: distant_light_in(_live.light, moved)}
+        _live.rotated = {**dict(list(_live.rotated.items())[-63:]), key: distant_light_in(_live.light, basis, moved)}
     return _live.rotated[key]
 
 
-def _known_bakes() -> Hashable:
-    """Changes when objects with bakes come, go, are renamed, get another bake or leave edit mode. Cheap."""
+Place = tuple[bpy.types.Object, bpy.types.Object, NDArray[np.float64] | None]
+
+
+def _bakes_here() -> dict[str, Place]:
+    """By name: an object with a bake, the scene's object that shows it, and for a collection's instance where it stands
+    relative to that. Cheap where nothing is instanced."""
+    found: dict[str, Place] = {o.name_full: (o, o, None) for o in baked_objects(bpy.context.scene)}
+    layer = bpy.context.view_layer
+    if not any(o.instance_type == "COLLECTION" and o.instance_collection for o in layer.objects):
+        return found
+    for instance in bpy.context.evaluated_depsgraph_get().object_instances:
+        if not instance.is_instance or instance.parent.original.instance_type != "COLLECTION":
+            continue
+        source, owner = instance.object.original, instance.parent.original
+        if baked_mesh(source) is not None and not is_receiver(source):
+            local = np.linalg.pinv(np.array(owner.matrix_world)) @ np.array(instance.matrix_world)  # small
+            found.setdefault(f"{owner.name_full}/{source.name_full}", (source, owner, local))
+    return found
+
+
+def _known(bakes: dict[str, Place]) -> Hashable:
+    """Changes when bakes come, go, are renamed, get other data or leave edit mode."""
     layer = bpy.context.view_layer.objects
-    carriers = ((found, baked_mesh(found)) for found in baked_objects(bpy.context.scene))
-    return tuple((found.name_full, mesh.session_uid, mesh.is_editmode, found.name in layer) for found, mesh in carriers)
+    return tuple((name, baked_mesh(found).session_uid, baked_mesh(found).is_editmode, owner.name in layer,
+                  None if local is None else local.round(5).tobytes()) for name, (found, owner, local) in bakes.items())
 
 
 def _read_bakes() -> None:
     """Read all baked objects of the scene; what can't be read is not shown, and the panel says why."""
-    _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known_bakes()
+    bakes = _bakes_here()
+    _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known(bakes)
     _live.lamps.forget_geometry()
     layer = {found.name_full for found in bpy.context.view_layer.objects}
-    for found in baked_objects(bpy.context.scene):
-        line = Line(found.name_full)
+    for name, (found, owner, local) in bakes.items():
+        line = Line(name)
         _live.lines.append(line)
         try:
             baked = read_baked(found)
@@ -267,15 +312,18 @@ def _read_bakes() -> None:
         line.overdraw_before = float(coherence.get("before", 0.0))
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
         line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
-        if found.name_full in layer:
-            _live.shown[found.name_full] = Shown(baked, (_context_key(), found.name_full, transfer_signature(baked)))
+        if owner.name_full in layer:
+            key = _context_key(), name, transfer_signature(baked)
+            _live.shown[name] = Shown(baked, key, owner.name_full, local)
+    _live.owners = {shown.owner for shown in _live.shown.values()}
     _read_stale()
 
 
 def _tell_panel() -> None:
     """Pass on to the panel what is known of the scene of this context."""
     state = session()
-    assign(state, cloud="\n".join(_cloud_lines()), preview_message=_live.message if state.preview else "")
+    assign(state, cloud="\n".join(_cloud_lines()), preview_message=_live.message if state.preview else "",
+           last_bake=_last_bake(bpy.context.scene.get(REPORT_PROPERTY, "")) if _live.lines else "")
     if [line.name for line in state.objects] != [line.name for line in _live.lines]:
         state.objects.clear()
         for line in _live.lines:
@@ -284,6 +332,16 @@ def _tell_panel() -> None:
         # Blender keeps floats in single precision.
         assign(told, **{name: float(np.float32(value)) if isinstance(value, float) else value
                         for name, value in vars(line).items()})
+
+
+@lru_cache(maxsize=4)
+def _last_bake(text: str) -> str:
+    """The report of the scene's last bake as lines of kind, share and words for the panel; empty without a report."""
+    try:
+        report = read_stored_report(text, "the report")
+    except PRTError:
+        return ""  # the buttons that show it say what is wrong
+    return "\n".join(f"{line.kind}\t{line.share:.3f}\t{line.text}" for line in summary(report)) if report else ""
 
 
 def _cloud_lines() -> list[str]:
@@ -329,19 +387,19 @@ def _read_stale() -> None:
     if around != _live.around:
         _live.around = around
         _live.lamps.forget_geometry()
-    objects = {found.name_full: found for found in bpy.context.scene.objects}
-    changed = False
+    bakes, changed = _bakes_here(), False
     for line in _live.lines:
-        found, shown = objects.get(line.name), _live.shown.get(line.name)
-        if found is None or shown is None:
+        shown = _live.shown.get(line.name)
+        if line.name not in bakes or shown is None:
             continue
-        before = shown.stale, shown.moved
+        found, owner, local = bakes[line.name]
+        matrix, before = _placed(owner, local), (shown.stale, shown.moved)
         try:
-            line.stale = stale(found, depsgraph, around) or ""
+            line.stale = stale(found, depsgraph, around, matrix) or ""
         except PRTError as error:
             line.stale = str(error)
         shown.stale = bool(line.stale)
-        shown.moved = None if shown.stale else transform_since_bake(found, shown.baked.header)
+        shown.moved = None if shown.stale else transform_since_bake(found, shown.baked.header, matrix)
         changed |= before[0] != shown.stale or not np.array_equal(before[1], shown.moved)
     if changed and any(shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature, _live.light_dirty = None, True
@@ -355,20 +413,15 @@ def _read_light() -> None:
         _live.signature, _live.light, _live.message = None, None, ""
         return
     started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
-    warnings: list[str] = []
-    order = max(shown.baked.lighting_basis.order for shown in _live.shown.values())
-    distant, signature = None, None
-    if order:
-        name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
-        found = light_coefficients(bpy.context.scene, depsgraph, order, window=bpy.context.scene.prt.window,
-                                   name_lamps=name_lamps)
-        distant, signature = found.coefficients, found.signature
-        warnings += found.warnings
+    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
+    distant, warnings, signature = distant_light(
+        bpy.context.scene, depsgraph, (shown.baked.lighting_basis for shown in _live.shown.values()),
+        window=bpy.context.scene.prt.window, name_lamps=name_lamps)
     _read_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
     _live.message = "\n".join(dict.fromkeys(warnings))
-    if (order, signature) != _live.signature:
-        _live.signature, _live.light, _live.rotated = (order, signature), distant, {}
+    if signature != _live.signature:
+        _live.signature, _live.light, _live.rotated = signature, distant, {}
         viewport.redraw()
 
 
@@ -376,7 +429,8 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     """Let the lamps' light follow; while some of it still fades, ask for the next step."""
     now, baked = time.perf_counter(), {name: shown.baked for name, shown in _live.shown.items()}
     moves = {name: shown.moved for name, shown in _live.shown.items() if shown.moved is not None}
-    lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time, moves)
+    lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time, moves,
+                             {name: shown.owner for name, shown in _live.shown.items()})
     _live.lamps_time = now
     _note_moves(lamps, now)
     signature = lamps_signature(lamps), frozenset(_live.moving)
@@ -458,7 +512,7 @@ def _follow() -> float | None:
     """Do for the scene of this context what is to be done; the seconds until there is more."""
     now = time.perf_counter()
     try:
-        if _live.bakes_dirty or _live.known != _known_bakes():
+        if _live.bakes_dirty or _live.known != _known(_bakes_here()):
             _live.light_dirty = True
             _read_bakes()
         if _live.stale_dirty and now >= _live.stale_due:

@@ -272,6 +272,16 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "need less memory, but hold more bases. 0 is one zone",
     )
 
+    compare_samples: IntProperty(
+        name="Samples", min=2, max=2 ** 16, soft_max=4096, default=64,
+        description="Samples of Cycles in each pixel. Four times as many halve its noise and cost four times the time",
+    )
+    compare_percentage: FloatProperty(
+        name="Size", min=1.0, max=100.0, default=50.0, precision=0, subtype="PERCENTAGE",
+        description="Of the output resolution. Half of it costs a quarter of the time; which pixels differ is seen "
+                    "less finely",
+    )
+
     def overrides(self) -> dict[str, str]:
         """What these settings change in their preset, by name, as `make_settings` takes it."""
         preset = PRESETS[self.preset]
@@ -334,6 +344,8 @@ class PRTSession(bpy.types.PropertyGroup):
     objects: CollectionProperty(type=PRTBakedObject)
     cloud: StringProperty()
     analysis: StringProperty()
+    last_bake: StringProperty()
+    comparison: StringProperty()
 
 
 def session(context: bpy.types.Context | None = None) -> PRTSession:

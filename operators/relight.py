@@ -8,8 +8,10 @@ import numpy as np
 
 from ..prt_addon.blender.stored import baked_mesh
 from ..prt_addon.errors import PRTError, StorageError
+from ..prt_addon.storage.files import save_arrays
+from .arguments import path_of
 from .properties import session
-from .relit import read_all, relit
+from .relit import radiance_arrays, read_all, relit
 
 ATTRIBUTE = "PRT Light"
 
@@ -22,6 +24,27 @@ class PRT_OT_relight(bpy.types.Operator):
     bl_idname = "prt.relight"
     bl_label = "Apply to Color Attribute"
     bl_options = {"REGISTER", "UNDO"}
+
+    environment: bpy.props.StringProperty(
+        name="Environment", subtype="FILE_PATH", options={"HIDDEN", "SKIP_SAVE"},
+        description="An equirectangular picture in place of the World; empty takes the World",
+    )
+    rotate: bpy.props.FloatProperty(
+        name="Rotate", options={"HIDDEN", "SKIP_SAVE"},
+        description="Degrees by which the environment is turned, as a Z rotation in the World's Mapping node does",
+    )
+    use_scene_lights: bpy.props.BoolProperty(
+        name="Scene's Lights", default=True, options={"HIDDEN", "SKIP_SAVE"},
+        description="With Suns, and lamps where they were baked, beside the environment",
+    )
+    window: bpy.props.BoolProperty(
+        name="Soften Ringing", options={"HIDDEN", "SKIP_SAVE"},
+        description="As in the panel, which counts unless this is given",
+    )
+    filepath: bpy.props.StringProperty(
+        name="File", subtype="FILE_PATH", options={"HIDDEN", "SKIP_SAVE"},
+        description="Where arrays of the light go (.npz, as the command writes them), in place of the attribute",
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -37,14 +60,21 @@ class PRT_OT_relight(bpy.types.Operator):
         scene = context.scene
         try:
             baked = read_all(scene, scene.name)
-            lit = relit(scene, baked, window=scene.prt.window)
-            for name, transfer in baked.items():
+            window = self.window if self.properties.is_property_set("window") else scene.prt.window
+            lit = relit(scene, baked, path_of(self.environment) if self.environment else None, self.rotate,
+                        self.use_scene_lights, window)
+            if self.filepath:
+                save_arrays(path_of(self.filepath), radiance_arrays(baked, lit))
+            for name, transfer in ({} if self.filepath else baked).items():
                 write_colours(baked_mesh(scene.objects[name]), lit.radiance(name, transfer))
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         for warning in lit.warnings:
             self.report({"WARNING"}, warning)
+        if self.filepath:
+            self.report({"INFO"}, f"Wrote {path_of(self.filepath)}")
+            return {"FINISHED"}
         carriers = [name for name in baked if baked_mesh(scene.objects[name]) != scene.objects[name].data]
         text = f"Lit {len(baked)} object{'' if len(baked) == 1 else 's'}"
         if carriers:

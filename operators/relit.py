@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
-from ..prt_addon.blender.lights import light_coefficients
+from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
 from ..prt_addon.errors import BadScene
 from ..prt_addon.relighting.exit_radiance import view_radiance
-from ..prt_addon.relighting.moved_light import distant_light_in
+from ..prt_addon.relighting.moved_light import distant_light_in, moved_normals, moved_points
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
 from .scene_lamps import SceneLamps
@@ -62,18 +62,37 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
     scene_lamps: kept by the caller from one light to the next, who tells it when geometry changes.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    order = max(b.lighting_basis.order for b in baked.values())
-    distant, warnings = None, []
-    if order:
-        found = light_coefficients(scene, depsgraph, order, environment, rotate, use_scene_lights, window,
-                                   all(b.cloud is None for b in baked.values()))
-        distant, warnings = found.coefficients, list(found.warnings)
+    distant, warnings, _ = distant_light(scene, depsgraph, (b.lighting_basis for b in baked.values()), environment,
+                                         rotate, use_scene_lights, window, all(b.cloud is None for b in baked.values()))
     moved = {name: transform_since_bake(scene.objects[name], b.header) for name, b in baked.items()}
     scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
     light, direct = {}, {}
     for name, b in baked.items():
-        seen = None if distant is None else distant_light_in(distant, moved[name])
+        seen = distant_light_in(distant, b.lighting_basis, moved[name])
         light[name] = joined_light(b.lighting_basis, seen, scene_lamps.cloud_light(b, moved[name]) if lamps else None)
         direct[name] = scene_lamps.direct(name, b, lamps, moved=moved[name]) if lamps else None
     return Lit(light, direct, moved, tuple(dict.fromkeys(warnings)))
+
+
+def radiance_arrays(baked: dict[str, BakedTransfer], lit: Lit) -> dict[str, NDArray]:
+    """What `prt relight` writes: radiance, position, normal, albedo (points, 3) float32 and object (points,) text."""
+    moved = lit.moved
+    return {
+        "radiance": np.concatenate([lit.radiance(n, b) for n, b in baked.items()]).astype(np.float32),
+        "position": np.concatenate([moved_points(b.positions, moved[n]) for n, b in baked.items()]).astype(np.float32),
+        "normal": np.concatenate([moved_normals(b.normals, moved[n]) for n, b in baked.items()]).astype(np.float32),
+        "albedo": np.concatenate([b.albedo for b in baked.values()]),
+        "object": np.concatenate([np.full(len(b.cluster), name) for name, b in baked.items()]),
+    }
+
+
+def draw_lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], lit: Lit, width: int, height: int,
+             background: NDArray[np.float32] | None = None, samples: int = 2) -> NDArray[np.float32]:
+    """The active camera's picture of all of them, through the viewport's shaders: as `offscreen.draw_items` gives it,
+    which also says what is raised."""
+    from ..gpu_shaders import offscreen  # a machine without a graphics driver can do all else
+    from ..gpu_shaders.render_data import DrawItem
+
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name]) for name, b in baked.items()]
+    return offscreen.draw_items(scene, items, width, height, background, samples)

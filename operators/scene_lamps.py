@@ -60,18 +60,21 @@ class SceneLamps:
         self._keys.clear()
 
     def step(self, baked: dict[str, BakedTransfer], depsgraph: bpy.types.Depsgraph,
-             warnings: list[str], seconds: float = AT_ONCE, moves: Moves | None = None) -> list[LocalLight]:
+             warnings: list[str], seconds: float = AT_ONCE, moves: Moves | None = None,
+             owners: Mapping[str, str] | None = None) -> list[LocalLight]:
         """Read the lamps and let their light in each cloud follow; `cloud_light` and `direct` then tell it.
 
         baked: objects by name; only those with a light cloud count. seconds: since the last step. moves: (4, 4) of each
-        object since its bake, where it was moved. Lamps that are outside a cloud are named in warnings.
+        object since its bake, where it was moved; owners: full names of the scene's objects that show them, where these
+        are others (collection instances). Lamps that are outside a cloud are named in warnings.
         """
         near = {name: b for name, b in baked.items() if b.cloud is not None}
         if not near:
             self._lit = {}
             return []
         visible = {found.name for found in render_visible_objects(depsgraph.view_layer).values()}
-        casting = [name for name in near if name in visible]
+        shown_by = owners or {}
+        casting = list(dict.fromkeys(owner for name in near if (owner := shown_by.get(name, name)) in visible))
         if not casting:
             self._lit = {}
             warnings.append(HIDDEN)

@@ -15,22 +15,24 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
-import numpy as np
 
 from ..prt_addon.baking.process import raise_error
 from ..prt_addon.baking.settings import BakeSettings, make_settings
-from ..prt_addon.blender.lights import environment_picture
+from ..prt_addon.blender.pictures import write_picture
 from ..prt_addon.blender.save import save_blend
 from ..prt_addon.errors import BadArguments, StorageError
-from ..prt_addon.relighting.moved_light import moved_normals, moved_points
 from ..prt_addon.reporting.headline import headline
 from ..prt_addon.reporting.html_report import render
 from ..prt_addon.reporting.report_file import read_report, write_report
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.files import save_arrays, save_json, write_atomically
+from .arguments import size_in
 from .bake_session import BakeSession, analyze_scene
+from .compare_session import CompareSession
+from .draw_camera import draw_to_file
+from .export import check_folder, export_bakes
 from .job_mixin import progress_text
-from .relit import Lit, read_all, relit
+from .relit import Lit, radiance_arrays, read_all, relit
 
 PROGRESS_SECONDS = 1.0  # between two lines of progress of one stage
 
@@ -74,39 +76,40 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
     scene = _open(arguments.input)
     baked = read_all(scene, str(arguments.input))
     lit = _lit(scene, baked, arguments, arguments.use_scene_lights)
-    radiances = [lit.radiance(name, b) for name, b in baked.items()]
-    save_arrays(arguments.output, {
-        "radiance": np.concatenate(radiances).astype(np.float32),
-        "position": np.concatenate([moved_points(b.positions, lit.moved[n]) for n, b in baked.items()]).astype("f4"),
-        "normal": np.concatenate([moved_normals(b.normals, lit.moved[n]) for n, b in baked.items()]).astype("f4"),
-        "albedo": np.concatenate([b.albedo for b in baked.values()]),
-        "object": np.concatenate([np.full(len(b.cluster), name) for name, b in baked.items()]),
-    })
+    save_arrays(arguments.output, radiance_arrays(baked, lit))
     yield str(arguments.output)
 
 
 def preview(arguments: argparse.Namespace) -> Iterator[str]:
     """The path written: the active camera's view, through the viewport's shaders."""
-    from ..gpu_shaders import offscreen  # a machine without a graphics driver has all other verbs
-    from ..gpu_shaders.render_data import DrawItem
-
     _check_output(arguments.output, (".png",), arguments.input)
+    _check_angle(arguments.rotate)
     scene = _open(arguments.input)
-    baked = read_all(scene, str(arguments.input))
-    lit = _lit(scene, baked, arguments, use_scene_lights=True)
-    percentage = scene.render.resolution_percentage / 100.0
-    width, height = arguments.size or (max(1, round(scene.render.resolution_x * percentage)),
-                                       max(1, round(scene.render.resolution_y * percentage)))
-    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name]) for name, b in baked.items()]
-    background = None
-    if not scene.render.film_transparent:
-        sky, rotation = environment_picture(scene, bpy.context.evaluated_depsgraph_get(), arguments.environment,
-                                            arguments.rotate)
-        sample = offscreen.environment_sampler(sky, rotation)
-        background = offscreen.camera_background(scene, sample, width, height)
-    picture = offscreen.draw_items(scene, items, width, height, background)
-    offscreen.write_png(arguments.output, picture, scene)
+    draw_to_file(scene, arguments.output, arguments.size or size_in(scene), arguments.environment, arguments.rotate,
+                 arguments.window, _warn)
     yield str(arguments.output)
+
+
+def compare(arguments: argparse.Namespace) -> Iterator[str]:
+    """The paths written: preview, Cycles and their difference as a picture and, where asked for, the numbers."""
+    _check_output(arguments.output, (".png",), arguments.input)
+    if arguments.report is not None:
+        _check_output(arguments.report, (".json",), arguments.input)
+    scene = _open(arguments.input)
+    session = CompareSession.start(scene, arguments.size or size_in(scene), arguments.samples)
+    try:
+        _follow(session)
+    finally:
+        session.process.cancel()
+    compared = session.finish()
+    write_picture(arguments.output, compared.picture)
+    if arguments.report is not None:
+        save_json(arguments.report, compared.result)
+    for line in compared.lines:
+        _tell(line)
+    yield str(arguments.output)
+    if arguments.report is not None:
+        yield str(arguments.report)
 
 
 def report(arguments: argparse.Namespace) -> Iterator[str]:
@@ -124,52 +127,20 @@ def report(arguments: argparse.Namespace) -> Iterator[str]:
 def export(arguments: argparse.Namespace) -> Iterator[str]:
     """The paths written: per object an .npz of everything stored, and baked.json that describes them."""
     folder = arguments.output
-    if folder.exists() and not folder.is_dir():
-        raise BadArguments(str(folder), "it is a file", "Give a folder")
+    check_folder(folder)
     _check_folder(folder.absolute().parent)
     scene = _open(arguments.input)
-    baked = read_all(scene, str(arguments.input))
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise StorageError(str(folder), f"can't be made ({error.strerror})", "Choose another folder") from error
-    written = {array: text for array, text in ARRAYS.items()
-               if any(getattr(transfer, array) is not None for transfer in baked.values())}
-    index = {"format": "prt", "schema": 1, "arrays": written, "objects": []}
-    for number, (name, transfer) in enumerate(baked.items()):
-        path = folder / f"{number:04d}_{_file_name(name)}.npz"
-        save_arrays(path, {array: getattr(transfer, array) for array in ARRAYS
-                           if getattr(transfer, array) is not None})
-        index["objects"].append({"name": name, "file": path.name, "header": transfer.header})
+    for path in export_bakes(read_all(scene, str(arguments.input)), folder):
         yield str(path)
-    save_json(folder / "baked.json", index)
-    yield str(folder / "baked.json")
-
-
-# What export writes of each object, described for whoever reads it without this program.
-ARRAYS = {
-    "cluster": "(points,) int32: the cluster of each point",
-    "weights": "(points, vectors) float32",
-    "bases": "(clusters, vectors+1, rows, columns, channels) float32; vector 0 is the cluster's mean; "
-             "M_p = bases[c,0] + sum_k weights[p,k] bases[c,k+1]; exit radiance = albedo * M_p . light; "
-             "with view-dependent rows: albedo * (row 0) + sum_i y_i(view in the point's frame) * (row i), the "
-             "functions i being the header's rows.functions",
-    "albedo": "(points, 3) float32, linear Rec.709",
-    "positions": "(points, 3) float32, world space when baked, metres, Z up",
-    "normals": "(points, 3) float32, world space when baked",
-    "triangles": "(triangles, 3) int32 into points",
-    "tangents": "(points, 3) float32, world space when baked: x of the point's frame, whose y is normal x tangent and "
-                "whose z is the normal; only where rows depend on the view",
-    "material": "(points,) int32 into kernels; only with view-dependent rows and a light cloud",
-    "kernels": "(materials, functions, n^2, 1 or 3) float32: rows 1, 2, ... of a lamp's direct light are kernel . "
-               "y(direction to the lamp in the point's frame) times its E / pi; share and dimming of the diffuse row "
-               "are in the header's lamp_surfaces",
-}
 
 
 def _tell(text: str) -> None:
     """A line for a person; stdout carries the result only."""
     print(f"prt: {text}", file=sys.stderr, flush=True)
+
+
+def _warn(text: str) -> None:
+    _tell(f"warning: {text}")
 
 
 def _settings(arguments: argparse.Namespace) -> BakeSettings:
@@ -216,7 +187,7 @@ def _writable(path: Path) -> bool:
     return os.access(path, os.W_OK) and bool(path.stat().st_mode & 0o222)
 
 
-def _follow(session: BakeSession) -> None:
+def _follow(session: BakeSession | CompareSession) -> None:
     """Wait for the child, with its progress on stderr."""
     stage, last = "", -math.inf
     for message in session.process.wait():
@@ -230,13 +201,13 @@ def _follow(session: BakeSession) -> None:
 def _lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: argparse.Namespace,
          use_scene_lights: bool) -> Lit:
     """The light that the arguments ask for, with its warnings on stderr."""
-    if not math.isfinite(arguments.rotate):
-        raise BadArguments("--rotate", f"{arguments.rotate} is no angle", "Give degrees")
+    _check_angle(arguments.rotate)
     lit = relit(scene, baked, arguments.environment, arguments.rotate, use_scene_lights, arguments.window)
     for warning in lit.warnings:
-        print(f"prt: warning: {warning}", file=sys.stderr, flush=True)
+        _warn(warning)
     return lit
 
 
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:80]
+def _check_angle(degrees: float) -> None:
+    if not math.isfinite(degrees):
+        raise BadArguments("--rotate", f"{degrees} is no angle", "Give degrees")

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import bpy
 
 from .layout import Sidebar, plural, wrapped
@@ -31,6 +33,32 @@ class PRT_PT_results(Sidebar, bpy.types.Panel):
         if len(session.objects) > ROWS:
             column.label(text=f"and {len(session.objects) - ROWS} more", icon="BLANK1")
         layout.operator("prt.clear", icon="TRASH")
+
+
+class PRT_PT_last_bake(Sidebar, bpy.types.Panel):
+    """Where the time of the last bake went, how large its errors are, what it left out."""
+
+    bl_idname = "PRT_PT_last_bake"
+    bl_label = "Last Bake"
+    bl_parent_id = "PRT_PT_results"
+    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return bool(context.window_manager.prt.last_bake)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        column = self.layout.column(align=True)
+        for line in context.window_manager.prt.last_bake.splitlines():
+            kind, share, text = line.split("\t", 2)
+            if kind in ("stage", "error"):
+                column.progress(factor=float(share), text=text)
+            elif kind == "heading":
+                column.separator()
+                column.label(text=text)
+            else:
+                wrapped(column, context, text, "REMOVE" if kind == "left_out" else "TIME")
+                column.separator()
 
 
 def draw_object(column: bpy.types.UILayout, context: bpy.types.Context, line: bpy.types.PropertyGroup) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The error budget of diffuse light: where the difference from the truth comes from, measured at random receivers.
 
-sampling: finite directions and gather rays, at the bake's own order of lighting; basis: light detail above that order;
+sampling: finite directions and gather rays, in the bake's own columns of light; basis: light detail finer than these;
 compression: clustered PCA; total: what is drawn against the full light. Each is a relative RMS of exit radiance over
 receivers and channels, under the scene's light, against independent paths, with a 95 % bootstrap interval.
 """
@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..basis.spherical_harmonics import evaluate
 from ..lighting.reference_light import ReferenceLight
-from ..linear_algebra import multiply
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.path_reference import DistantSuns, reference_radiance
 from ..transport.receiver_set import ReceiverSet
+from .distant_basis import DistantBasis
 
 RESAMPLES = 400
 # Receivers of one object below which its own error is not told: their interval would span everything.
@@ -49,15 +48,15 @@ def choose_receivers(candidates: NDArray[np.int64], count: int, seed: int) -> ND
 
 
 def error_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], sample: BakedSample,
-                 light: ReferenceLight, order: int, bounces: int, paths: int, seed: int,
+                 light: ReferenceLight, basis: DistantBasis, bounces: int, paths: int, seed: int,
                  ) -> Generator[float, None, dict[str, Any]]:
     """Yield progress, return {"sampling", "basis", "compression", "total"}: see `_entry` for each value's fields."""
     receivers = ReceiverSet.of_keys(scene, tracer, sample.keys)
     place = np.searchsorted(sample.keys, receivers.key)  # reference receivers are in Morton order
-    coefficients = light.coefficients(order)
+    coefficients = basis.coefficients(light)
 
     def emission(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        banded = multiply(evaluate(order, directions), coefficients)
+        banded = basis.radiance(coefficients, directions)
         return np.stack([banded, light.radiance(directions)], axis=1)
 
     suns = DistantSuns(light.sun_directions, light.sun_irradiance, light.sun_angles)

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh
+from ..transport.column_arrays import COLUMNS_AT_ONCE
 from ..transport.incident_light import NUMBERS
 from ..transport.interreflection import SLOW_RATIO
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
-from .settings import BakeSettings
+from .distant_basis import array_budget, distant_basis
+from .settings import EIGENTRANSPORT, BakeSettings
 from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
@@ -24,7 +26,7 @@ SHADOW_RAYS_PER_SECOND = 3.5e6
 GATHER_RAYS_PER_SECOND = 1.2e6
 PATH_RAYS_PER_SECOND = 0.8e6
 SECONDS_PER_BOUNCED_VALUE = 2e-8
-SECONDS_PER_ENCODED_VALUE = 1.2e-8
+SECONDS_PER_ENCODED_VALUE, SECONDS_PER_PROJECTED_VALUE = 1.2e-8, 5e-10
 SECONDS_PER_GLOSSY_VALUE = 1e-7
 SECONDS_PER_LOCAL_VALUE = 2e-7
 # Of highlights of local light, for each value of their rows: filled, and encoded (many more values for each receiver
@@ -79,14 +81,18 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     """The plan of a bake, from counts alone."""
     loose = scene.loose
     receivers = sum(int((~loose[o.points]).sum()) for o in scene.objects if o.is_target)
-    shadow, gather = receivers * settings.directions // 2, receivers * settings.gather_directions // 2
+    basis = distant_basis(settings, settings.order)
+    shadow, gather = receivers * basis.rays(settings.directions), receivers * settings.gather_directions // 2
     surfaces = plan_surfaces(scene, settings)
     needs = decide(scene, settings.order, settings.bounces, (shadow, gather),
-                   light.highest_order(settings.order) if light is not None else None, settings.fit_order_to_light,
-                   surfaces.coloured)
+                   light.highest_order(settings.order) if light is not None and not basis.cubemap else None,
+                   settings.fit_order_to_light, surfaces.coloured)
     needs.left_out += surfaces.left_out
     needs.hints += surfaces.hints
-    columns = needs.order ** 2
+    if basis.cubemap and not all(material.is_diffuse for material in scene.materials):
+        needs.hints.append("a cubemap's columns hold diffuse light only: highlights and light through bodies need"
+                           " distant_basis=sh")
+    columns = distant_basis(settings, needs.order).columns
     values = receivers * columns * needs.channels
     glossy, translucent = int(surfaces.glossy_points(scene).sum()), int(surfaces.translucent_points(scene).sum())
     seconds, rays = {"prepare": 0.2 + 1e-6 * len(scene.triangles)}, {}
@@ -112,7 +118,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
             seconds["local"] = 2.0 * seconds["local"] + wide * SECONDS_PER_LOCAL_ROW
     if translucent:
         seconds["subsurface"] = 0.2 + translucent * columns * needs.channels * SECONDS_PER_SUBSURFACE_VALUE
-    seconds["encode"] = (0.2 + values * max(1, settings.vectors) * SECONDS_PER_ENCODED_VALUE
+    per_value = SECONDS_PER_PROJECTED_VALUE if settings.encoder == EIGENTRANSPORT else SECONDS_PER_ENCODED_VALUE
+    seconds["encode"] = (0.2 + values * max(1, settings.vectors) * per_value
                          + wide * SECONDS_PER_WIDE_VALUE)
     if settings.error_receivers:
         # Diffuse light and highlights are measured apart, each with paths of about two rays.
@@ -153,7 +160,8 @@ def _shapes(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
             share: float = TYPICAL_MERGED_SHARE) -> list[tuple[int, tuple[int, int, int]]]:
     """Of each target, its receivers and the shape of their matrices (rows, columns, channels). share: of lights that
     is left after merging."""
-    columns = (needs.order ** 2 if settings.distant_light else 0) + _local_columns(settings, share)
+    distant = distant_basis(settings, needs.order).columns if settings.distant_light else 0
+    columns = distant + _local_columns(settings, share)
     return [(int((~scene.loose[o.points]).sum()),
              (1 + len(surfaces.functions_of_object(scene, o)), columns, needs.channels))
             for o in scene.objects if o.is_target]
@@ -174,7 +182,12 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
     glossy = int(surfaces.glossy_points(scene).sum())
     hits_each = settings.gather_directions / 2 * TYPICAL_HIT_SHARE if needs.bounces else 0.0
     operator, kept = receivers * hits_each * BYTES_PER_RAY_HIT, glossy * hits_each * BYTES_PER_KEPT_HIT
-    transfer = 4 * receivers * needs.order ** 2 * needs.channels
+    basis = distant_basis(settings, needs.order)
+    transfer = whole = solved = 4 * receivers * basis.columns * needs.channels
+    if basis.cubemap:  # solved in blocks, and on disk beyond the budget
+        solved = transfer * min(1.0, COLUMNS_AT_ONCE / basis.columns)
+        transfer = min(transfer, array_budget(settings) or transfer)
+        solved += transfer / COPIES_OF_SERIES
     rows = 4 * glossy * len(surfaces.functions) * needs.order ** 2 * needs.channels
     visibility = 4 * glossy * ((INCIDENT_ORDER + needs.order - 1) ** 2 + INCIDENT_ORDER ** 2)
     known = operator + kept + visibility
@@ -186,11 +199,11 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
     local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions), share)
     shapes = _shapes(scene, settings, needs, surfaces, share)
     stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
-              known + second + copies * transfer,
+              known + second + copies * solved,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
               known + transfer + rows + local.kept + max(local.zone, second + local.solving),
               _encoding(settings, shapes, rows + local.kept, transfer)]
-    disk = operator + kept + visibility + 2 * transfer + rows + local.kept + local.responses
+    disk = operator + kept + visibility + 2 * whole + rows + local.kept + local.responses
     loose = LOOSE_LOCAL if settings.local_light else 1.0
     return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + loose * max(stages)), int(disk)
 
@@ -234,19 +247,25 @@ def _encoding(settings: BakeSettings, shapes: list[tuple[int, tuple[int, int, in
               transfer: int) -> float:
     """Bytes while signals are made and encoded, object by object."""
     signals = sum(4 * count * math.prod(shape) for count, shape in shapes)
+    if settings.distant_light and settings.distant_basis == "cubemap":
+        signals = min(signals, transfer)
     largest = 0.0
     for count, shape in shapes:
         values = math.prod(shape)
         bases = most_clusters(settings, count, shape) * (settings.vectors + 1) * values * BYTES_PER_BASE_VALUE
+        held = min(4 * count * values, signals)
         turned = 4 * count * min(values, MOST_AXES) + 4 * COPIES_OF_ROWS * min(count, ENCODED_ROWS) * values
-        largest = max(largest, 4 * count * values + turned + bases)
+        largest = max(largest, held + turned + bases)
     return transfer + signals + max(rows, largest)
 
 
 def most_clusters(settings: BakeSettings, receivers: int, shape: tuple[int, int, int]) -> int:
     """Clusters that an object of so many receivers may have; shape: of its matrices, (rows, columns, channels)."""
+    if settings.encoder == EIGENTRANSPORT:
+        return 1
     most = -(-receivers // RECEIVERS_PER_CLUSTER)
-    if shape[0] > 1:  # there the bases are nearly all that is stored
+    # There the bases are nearly all that is stored.
+    if shape[0] > 1 or (settings.distant_light and settings.distant_basis == "cubemap"):
         matrices = min(receivers // RECEIVERS_PER_MATRIX, MOST_BASES // (4 * shape[0] * shape[1] * shape[2]))
         most = min(most, matrices // (settings.vectors + 1))
     return max(1, min(settings.clusters, most))

@@ -52,6 +52,13 @@ class BakeProcess:
     job: the folder made by `job.write_job`. The result is left in it; read it after a "done" message.
     """
 
+    # What a process of another kind (blender/ground_truth.py) calls otherwise.
+    subject = "Bake"
+    remedy = "The previous bake is untouched; bake again to resume"
+    memory_remedy = "Choose a lower order, fewer directions, lights or objects and bake again to resume"
+    lost_remedy = "The previous bake is untouched; bake again, and leave the folder alone"
+    cancel_remedy = "Bake again to resume where it stopped"
+
     def __init__(self, python_command: list[str], job: Path) -> None:
         self.python_command = list(python_command)
         self.job = Path(job)
@@ -82,9 +89,8 @@ class BakeProcess:
                 creationflags=_creation_flags(),
             )
         except OSError as error:
-            raise PRTError(
-                "Bake process", f"Python could not be started ({error})", "Check the Blender installation"
-            ) from error
+            raise PRTError(f"{self.subject} process", f"{Path(command[0]).name} could not be started ({error})",
+                           "Check the Blender installation") from error
 
     def poll(self) -> list[Message]:
         """The messages since the last call; never waits. The last one of a bake is "done" or "error"."""
@@ -148,35 +154,32 @@ class BakeProcess:
         """End the child whose folder somebody deleted, and the message for it."""
         self.finished = True
         self.cancel()
-        return error_message(PRTError("Bake", "its job folder was deleted while it ran",
-                                      "The previous bake is untouched; bake again, and leave the folder alone"))
+        return error_message(PRTError(self.subject, "its job folder was deleted while it ran", self.lost_remedy))
 
     def _death(self) -> Message:
         """The message for a child that ended without saying why."""
         code = self.returncode
         if self._cancelled:
-            return error_message(Cancelled("Bake", "cancelled", "Bake again to resume where it stopped"))
+            return error_message(Cancelled(self.subject, "cancelled", self.cancel_remedy))
         if code == CANT_WRITE:
             return error_message(PRTError(str(self.job), "the disk is full, or the job folder can't be written",
                                           "The previous bake is untouched; free some space and bake again to resume"))
         last = _last_line(self.job / ERROR_FILE)
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
-            cause = f"the bake process was ended by signal {name}"
+            cause = f"its process was ended by signal {name}"
         else:
-            cause = f"the bake process ended with status {code}" + (f" ({last})" if last else "")
+            cause = f"its process ended with status {code}" + (f" ({last})" if last else "")
         if code == -9:
             cause += ", most often because memory ran out"
-            remedy = "Choose a lower order, fewer directions, lights or objects and bake again to resume"
-        else:
-            remedy = "The previous bake is untouched; bake again to resume"
-        return error_message(PRTError("Bake", cause, remedy))
+        return error_message(PRTError(self.subject, cause, self.memory_remedy if code == -9 else self.remedy))
 
 
 class CompletedBake:
     """Stands for the process of a bake that was complete before: its result lies in the job folder already."""
 
     finished = False
+    subject, cancel_remedy = BakeProcess.subject, BakeProcess.cancel_remedy
 
     def poll(self) -> list[Message]:
         """The end, at once."""

@@ -11,7 +11,7 @@ import time
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from scipy import sparse
 
 from ..basis.directions import quadrature
 from ..compression.coherence import Coherence, make_coherent
+from ..compression.eigentransport import eigentransport
 from ..compression.encoding import Encoding, encode
 from ..compression.groups import encode_groups
 from ..compression.settings import EncoderSettings
@@ -45,6 +46,8 @@ from ..transport.hit_record import HitRecord
 from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, IndirectLight, SumOfRadiances
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
+from .cubemap import bounced_cubemap, by_point, cubemap_signal, direct_cubemap, is_kept, without_scale
+from .distant_basis import distant_basis
 from .error_budget import BakedSample, choose_receivers, error_budget
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
@@ -64,7 +67,7 @@ from .results import (
     surface_checks,
     white_world_checks,
 )
-from .settings import BakeSettings
+from .settings import EIGENTRANSPORT, BakeSettings
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
@@ -117,10 +120,12 @@ def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = Non
 
 def transport_settings(settings: BakeSettings) -> BakeSettings:
     """What the stages of distant light are asked for where only local light is baked: a white sky of one coefficient
-    still tells what is buried, dark, or brighter than it can be."""
-    if settings.distant_light:
-        return settings
-    return replace(settings, order=1, subsurface=False)
+    still tells what is buried, dark, or brighter than it can be. A cubemap's columns hold diffuse light only."""
+    if not settings.distant_light:
+        return replace(settings, order=1, subsurface=False)
+    if settings.distant_basis == "cubemap":
+        return replace(settings, order=1, glossy_rows=0, subsurface=False)
+    return settings
 
 
 @dataclass
@@ -150,6 +155,7 @@ class _Bake:
         self.rays_resumed = 0
         self.tracer: Tracer | None = None
         self.plan: Plan = make_plan(self.scene, self.settings, self.light)
+        self.basis = distant_basis(self.settings, self.plan.needs.order)
         self.memory_warning = memory_warning(self.plan, self.settings)
         self.timer = StageTimer(lambda: self.tracer.rays if self.tracer else 0)
         self.stage_order = list(self.plan.seconds)
@@ -168,7 +174,7 @@ class _Bake:
             with self.timer.stage("interreflection"):
                 # The few shadow rays of a bake for lamps alone know less of what a receiver sees than its gather rays.
                 if self.settings.distant_light:
-                    gathered = balanced(gathered, transfer[:, 0])
+                    gathered = balanced(gathered, self.basis.white(transfer[:, :, None])[:, 0] / np.sqrt(4.0 * np.pi))
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
@@ -319,6 +325,12 @@ class _Bake:
             visibility = VisibilityCoefficients(found["rows"], found["visible"], found.get("blocked")) \
                 if "rows" in found else None
             return receivers, found["transfer"], visibility
+        if self.basis.cubemap:
+            transfer = yield from self._follow("direct", direct_cubemap(
+                self.tracer, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.folder))
+            if is_kept(transfer, self.settings):
+                self._save("direct", {"transfer": transfer})
+            return receivers, transfer, None
         plain = None
         if self.glossy.any():
             front = receivers.key < len(self.scene.points)
@@ -471,6 +483,10 @@ class _Bake:
         for target in self.targets:
             functions = self.surfaces.functions_of_object(scene, target)
             material, diffuse = scene.material[target.points], transfer[target.points]
+            if self.basis.cubemap:
+                signals[target.name] = cubemap_signal(diffuse, share[material], channels, self.basis, self.settings,
+                                                      self.folder)
+                continue
             signal = np.zeros((len(diffuse), 1 + len(functions), diffuse.shape[1], channels), np.float32)
             signal[:, 0] = diffuse * share[material, None, None]
             if glossy is not None and len(functions) == glossy.rows.shape[1]:
@@ -504,16 +520,21 @@ class _Bake:
         stored = self._load("interreflection")
         if stored is not None:
             return Interreflection(stored[0]["transfer"], **stored[1])
-        point = gathered.receivers.key % len(self.scene.points)
-        bounced = yield from self._follow_slow("interreflection", interreflect(
-            gathered.matrix, self.albedo[point][:, :self.plan.needs.channels], direct, self.settings.bounce_error,
-            self.settings.bounces))
-        numbers = {k: v for k, v in asdict(bounced).items() if k != "transfer"}
+        point, settings = gathered.receivers.key % len(self.scene.points), self.settings
+        albedo = self.albedo[point][:, :self.plan.needs.channels]
+        bounced = yield from self._follow_slow("interreflection", (
+            bounced_cubemap(gathered.matrix, albedo, direct, settings, self.folder) if self.basis.cubemap else
+            interreflect(gathered.matrix, albedo, direct, settings.bounce_error, settings.bounces)))
+        if self.basis.cubemap and not is_kept(bounced.transfer, settings):
+            return bounced
+        numbers = {k: v for k, v in vars(bounced).items() if k != "transfer"}
         self._save("interreflection", {"transfer": bounced.transfer}, numbers)
         return bounced
 
     def _by_point(self, receivers: ReceiverSet, transfer: NDArray[np.float32]) -> NDArray[np.float32]:
         """Transfer (points, columns, channels) in the order of the scene's points, zero where there is none."""
+        if self.basis.cubemap:
+            return by_point(receivers.key, transfer, len(self.scene.points), self.settings, self.folder)
         result = np.zeros((len(self.scene.points), *transfer.shape[1:]), np.float32)
         front = receivers.key < len(result)
         result[receivers.key[front]] = transfer[front]
@@ -524,7 +545,7 @@ class _Bake:
         if self.buried is not None:
             return
         receivers = self.receivers.taken(np.flatnonzero(np.isin(self.receivers.key, self.keys)))
-        white = transfer[receivers.key, 0].max(axis=1) * np.sqrt(4.0 * np.pi)
+        white = self.basis.white(transfer)[receivers.key].max(axis=1)
         self.buried = buried_receivers(self.tracer, self.scene, receivers, white)
         self.open_keys = np.setdiff1d(self.keys, self.buried, assume_unique=True)
 
@@ -595,7 +616,10 @@ class _Bake:
     def _encode_one(self, target: SceneObject, signal: NDArray[np.float32], settings: EncoderSettings,
                     metric: NDArray[np.float64] | None, state: _EncodeState) -> Encoding:
         """One target's encoding, made coherent where that is asked for."""
-        if self.local is None:
+        if self.local is None and self.settings.encoder == EIGENTRANSPORT and metric is None:
+            encoding = eigentransport(signal, settings.vectors, target_error=settings.target_error,
+                                      seed=settings.seed, progress=state.report).encoding
+        elif self.local is None:
             encoding = encode(signal, settings, metric, state.report)
         else:
             zone = self.local.zone[target.points][~self.scene.loose[target.points]]
@@ -606,13 +630,14 @@ class _Bake:
             encoding, self.coherence[target.name] = make_coherent(
                 encoding, triangles, signal, self.settings.coherence, metric, self.shapes[target.name][0],
                 tick=lambda: state.report(state.fraction))
-        return encoding
+        return without_scale(encoding, self.basis, self.shapes[target.name])
 
     def _encoder_settings(self, receivers: int, shape: tuple[int, int, int]) -> EncoderSettings:
         settings = self.settings
         target = settings.compression_error ** 2 if settings.compression_error > 0.0 else None
         clusters = most_clusters(settings, receivers, shape)
-        return EncoderSettings(clusters, settings.vectors, settings.encoder, settings.seed, target_error=target,
+        method = "static" if settings.encoder == EIGENTRANSPORT else settings.encoder
+        return EncoderSettings(clusters, settings.vectors, method, settings.seed, target_error=target,
                                threads=settings.threads,
                                vectors_limit=24 if settings.encoder == "adaptive" else None)
 
@@ -626,12 +651,12 @@ class _Bake:
         keys = choose_receivers(self.open_keys[shown[self.open_keys]], settings.error_receivers, settings.seed)
         if not len(keys):
             return {}
-        shape = (1, transfer.shape[1], channels)
+        shape = (1, self.basis.columns, channels)
         compressed = self._compressed(keys, encodings, slice(0, 1), shape)[:, 0] / share[keys, None, None]
         before = np.broadcast_to(transfer[keys], compressed.shape).astype(np.float64)
         sample = BakedSample(keys, before, compressed, *self._objects_of(keys))
         steps = error_budget(self.tracer, self.scene, self.albedo, sample, self.light or stand_in_light(),
-                             self.plan.needs.order, settings.bounces, settings.error_paths, settings.seed)
+                             self.basis, settings.bounces, settings.error_paths, settings.seed)
         last = 1.0 if self.highlights is None else 0.5
         return (yield from self._follow("errors", steps, 0.0, last))
 
@@ -708,7 +733,7 @@ class _Bake:
                 encodings: dict[str, Encoding], errors: tuple[dict[str, Any], dict[str, Any]],
                 bodies: list[BodyLight]) -> BakeResult:
         """errors: the budget of diffuse light and that of highlights."""
-        stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings)
+        stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings, self.basis)
         stability += surface_checks(self.surfaces, bodies)
         if self.settings.distant_light:
             stability += white_world_checks(self._white_worlds(encodings))
@@ -734,7 +759,8 @@ class _Bake:
         objects = {
             target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],
                                           self.surfaces.functions_of_object(self.scene, target), self.settings, report,
-                                          self.digests.get(target.name, ""), self._local_columns(target.name))
+                                          self.digests.get(target.name, ""), self.basis,
+                                          self._local_columns(target.name))
             for target in self.targets
         }
         if self.local is not None:

@@ -20,13 +20,14 @@ from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
-from ..storage.columns import Columns, columns_entry, surfaces_entry
+from ..storage.columns import columns_entry, surfaces_entry
 from ..storage.container import CONSTANT_ROWS, BakedTransfer, hemisphere_rows, make_header
 from ..storage.digests import digest_json
 from ..transport.gather import Gather
 from ..transport.interreflection import LARGEST_ALBEDO, Interreflection
+from .distant_basis import DistantBasis, distant_basis
 from .plan import Plan, most_clusters
-from .settings import BakeSettings
+from .settings import EIGENTRANSPORT, BakeSettings
 from .surfaces import SurfacePlan, WhiteWorld
 from .translucency import BodyLight
 
@@ -38,6 +39,8 @@ REPORT_SCHEMA = 1
 ENERGY_LIMIT, LOOSE_ENERGY_LIMIT = 1.005, 1.1
 # Few functions of the view overshoot a highlight's edge by up to a seventh; what they undershoot is bounded at black.
 DARKEST_VIEW, BRIGHTEST_VIEW = 0.01, 1.15
+# Receivers whose transfer is looked at in one go.
+KEYS_AT_ONCE = 4096
 # An object most of whose receivers see no sky and no surface that does is probably wound inwards.
 DARK_LIMIT = 0.5
 # The dipole is a half-space's: a body that loses more of its light by its sides looks like another material.
@@ -46,18 +49,18 @@ LOST_LIMIT = 0.25
 
 def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, shape: tuple[int, int, int],
                      functions: Indices, settings: BakeSettings, report: dict[str, Any], geometry_digest: str,
-                     local: LocalColumns | None = None) -> BakedTransfer:
-    """The container of one target. shape: (rows, columns, channels); functions: of rows 1, 2, ...; local: what is to
-    be known of columns of local lights. Loose points join cluster 0 with no weights."""
+                     basis: DistantBasis, local: LocalColumns | None = None) -> BakedTransfer:
+    """The container of one target. shape: (rows, columns, channels); functions: of rows 1, 2, ...; basis: of distant
+    light; local: what is to be known of columns of local lights. Loose points join cluster 0 with no weights."""
     bases = encoding.bases.reshape(*encoding.bases.shape[:2], *shape)
     count, solid = target.points.stop - target.points.start, ~scene.loose[target.points]
     cluster = np.zeros(count, np.int32)
     weights = np.zeros((count, encoding.weights.shape[1]), np.float32)
     cluster[solid], weights[solid] = encoding.cluster, encoding.weights
     if local is None:
-        columns = columns_entry(Columns(round(shape[1] ** 0.5)))
+        columns = columns_entry(basis.entry())
     else:
-        columns = local.entry(shape[1])
+        columns = local.entry(basis if settings.distant_light else DistantBasis(0))
         bases[:, :, :, shape[1] - local.cloud.columns:] /= np.float32(local.scale)
     header = make_header(
         bases.shape,
@@ -97,10 +100,10 @@ class LocalColumns:
     cluster_zone: NDArray[np.int32]
     scale: float
 
-    def entry(self, columns: int) -> dict[str, Any]:
-        """`columns` of a header, for so many in all."""
+    def entry(self, distant: DistantBasis) -> dict[str, Any]:
+        """`columns` of a header, those of distant light first."""
         cloud = self.cloud
-        basis = Columns(round((columns - cloud.columns) ** 0.5), cloud.columns)
+        basis = distant.entry(cloud.columns)
         if isinstance(cloud, LitSurfaces):
             return surfaces_entry(basis, len(cloud.corners), cloud.axes.shape[1], len(self.cluster_zone))
         return columns_entry(basis, cloud.emission_order, float(cloud.spacing), float(cloud.radius),
@@ -113,12 +116,12 @@ def _check(check: str, value: float, limit: float, good: str, bad: str) -> dict[
 
 
 def stability_of(scene: SceneMesh, transfer: NDArray[np.float32], keys: NDArray[np.int64], gathered: Gather | None,
-                 bounced: Interreflection | None, settings: BakeSettings) -> list[dict[str, Any]]:
+                 bounced: Interreflection | None, settings: BakeSettings, basis: DistantBasis) -> list[dict[str, Any]]:
     """Checks that hold for every physically possible bake, with what it means where they do not."""
-    values = transfer[keys]
-    checks = [_check("values that are not finite", float((~np.isfinite(values)).sum()), 0.0, "ok",
-                     "broken: please report this scene")]
-    white = values[:, 0].max(axis=1, initial=0.0) * np.sqrt(4.0 * np.pi)
+    wrong = sum(int((~np.isfinite(transfer[keys[start:start + KEYS_AT_ONCE]])).sum())
+                for start in range(0, len(keys), KEYS_AT_ONCE))
+    checks = [_check("values that are not finite", float(wrong), 0.0, "ok", "broken: please report this scene")]
+    white = basis.white(transfer)[keys].max(axis=1, initial=0.0)
     # Where only lamps are baked, few shadow rays check the scene, and the operator is not balanced with them.
     limit = ENERGY_LIMIT if settings.distant_light else LOOSE_ENERGY_LIMIT
     checks.append(_check("brightest receiver in a white unit environment", float(white.max(initial=0.0)), limit,
@@ -179,7 +182,8 @@ def report_of(scene: SceneMesh, settings: BakeSettings, plan: Plan, timer: Stage
               ) -> dict[str, Any]:
     """The report of design/contract.md, with what else a reader may want."""
     left_out = [*plan.needs.left_out, *_left_out_later(plan, settings, gathered, encodings)]
-    windowing = _windowing(light, plan.needs.order, left_out)
+    basis = distant_basis(settings, plan.needs.order)
+    windowing = None if basis.cubemap else _windowing(light, plan.needs.order, left_out)
     stages = timer.stages
     rays = sum(int(stage["rays"]) for stage in stages)
     measured = {"errors": errors, "highlight_errors": highlight_errors}
@@ -270,8 +274,10 @@ def _left_out_later(plan: Plan, settings: BakeSettings, gathered: Gather | None,
         found.append(LeftOut("light on the backs of surfaces",
                              f"backs fill {gathered.back_share:.2%} of the mean receiver's hemisphere",
                              "a second receiver at each point seen from behind"))
+    if settings.encoder == EIGENTRANSPORT:
+        return found  # one cluster was asked for
     for name, encoding in encodings.items():
-        columns, channels = plan.needs.order ** 2, plan.needs.channels
+        columns, channels = distant_basis(settings, plan.needs.order).columns, plan.needs.channels
         shape = (encoding.bases.shape[2] // (columns * channels), columns, channels)
         used, most = len(encoding.vectors_per_cluster), most_clusters(settings, len(encoding.cluster), shape)
         if encoding.adaptive_left_out:

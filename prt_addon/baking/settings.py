@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
+from ..compression.eigentransport import MOST_VECTORS
 from ..compression.settings import METHODS
 from ..errors import BadArguments
 
@@ -15,6 +16,11 @@ LIGHTINGS = ("environment", "local", "environment,local")
 LAMP_BASES = ("surfaces", "cloud")
 MERGED_RESPONSES = ("arithmetic", "harmonic", "solution")
 MOST_CLOUD_LIGHTS = 4096
+DISTANT_BASES = ("sh", "cubemap")
+EIGENTRANSPORT = "eigentransport"
+ENCODERS = (*METHODS, EIGENTRANSPORT)
+# Vectors of a cluster: more than this only where there is but one cluster.
+MOST_CLUSTER_VECTORS = 24
 
 
 @dataclass(frozen=True)
@@ -27,7 +33,8 @@ class BakeSettings:
     bounces: of light; -1 = until less than bounce_error of the energy is left.
     bounce_error: relative energy that may be left out of the bounces.
     clusters, vectors: most clusters, and vectors per cluster, of the encoding (fewer where the signal needs fewer).
-    encoder: "static", "iterative" or "adaptive" (Sloan 2003, 4.1-4.3).
+    encoder: "static", "iterative" or "adaptive" (Sloan 2003, 4.1-4.3), or "eigentransport" (Nowrouzezahrai 2007): one
+        cluster for all receivers, with up to 192 vectors.
     compression_error: relative RMS error of the encoding at which it stops; 0 uses all clusters and vectors.
     coherence: share of the squared error that may be added to the encoding so that fewer triangles lie in more than one
         cluster (Sloan 2003, section 5; the paper spent 0.05 to 0.1). 0 = off, because drawing does not need it: each
@@ -41,6 +48,10 @@ class BakeSettings:
         most); below, its light stays in the diffuse layer.
     glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
+    distant_basis: what World and Suns are baked in. "sh": spherical harmonics of `order`. "cubemap": the texels of a
+        cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
+        harmonics blur them. Costs memory and time with the texels' number; diffuse light only.
+    memory_budget: GB of transfer kept in memory while a cubemap is baked; what is more goes to a file; 0 = no limit.
     fit_order_to_light: lower the order to what the scene's present light carries.
     lighting: "environment" (World and Suns), "local" (lamps that move within a light cloud), or both with a comma.
     lamp_basis: what the columns of lamps stand for. "surfaces": the surfaces that lamps shine on, found by shadow rays
@@ -84,6 +95,9 @@ class BakeSettings:
     glossy_albedo: float = 0.15
     glossy_window: bool = True
     subsurface: bool = True
+    distant_basis: str = "sh"
+    cubemap_size: int = 16
+    memory_budget: float = 2.0
     fit_order_to_light: bool = False
     lighting: str = "environment"
     lamp_basis: str = "surfaces"
@@ -137,7 +151,9 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "bounces": (-1, 1000, "-1 means as many as it takes"),
     "bounce_error": (1e-7, 1.0, "single precision ends at 1e-7"),
     "clusters": (1, 4096, "the shader's cluster table"),
-    "vectors": (0, 24, "six FLOAT4 attributes"),
+    "vectors": (0, MOST_VECTORS, "48 FLOAT4 attributes"),
+    "cubemap_size": (2, 32, "6,144 columns"),
+    "memory_budget": (0.0, 1e6, "0 means no limit"),
     "compression_error": (0.0, 1.0, "it is relative"),
     "coherence": (0.0, 0.5, "the encoder's work would be undone"),
     "spacing": (0.0, 1.0, "it is a fraction of the diagonal"),
@@ -205,11 +221,15 @@ def check(settings: BakeSettings) -> BakeSettings:
     if settings.glossy_rows not in GLOSSY_ROWS:
         raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
                            f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
-    for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES), ("lamp_basis", LAMP_BASES)):
+    for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES), ("lamp_basis", LAMP_BASES),
+                        ("distant_basis", DISTANT_BASES)):
         if getattr(settings, name) not in words:
             raise BadArguments(f"setting {name}", f"{getattr(settings, name)!r} is unknown",
                                f"Use one of {' or '.join(words)}")
-    if settings.encoder not in METHODS:
+    if settings.encoder not in ENCODERS:
         raise BadArguments("setting encoder", f"{settings.encoder!r} is not an encoder",
-                           f"Use one of {', '.join(METHODS)}")
+                           f"Use one of {', '.join(ENCODERS)}")
+    if settings.vectors > MOST_CLUSTER_VECTORS and settings.encoder != EIGENTRANSPORT:
+        raise BadArguments("setting vectors", f"{settings.vectors} is outside 0 to {MOST_CLUSTER_VECTORS} (six FLOAT4 "
+                           "attributes)", "Choose a value inside, or encoder=eigentransport")
     return settings

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from ..basis.spherical_harmonics import rotate
 from ..lighting.analytic import sun
+from ..lighting.cubemap_light import Turn, sun_texels
+from ..lighting.distant_light import DistantLight
 from ..lighting.environment import apply_bands, band_energies, world_rotation
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import remove_ringing
+from ..storage.columns import Columns
 from ..storage.digests import digest_arrays
 from .nodes import constant_of, source_of
 from .visibility import render_visible_objects
@@ -74,6 +77,44 @@ def light_coefficients(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, o
             parts.append({"name": "window", "kind": "window", "cost": windowing.cost, "strength": windowing.strength})
     coefficients = np.ascontiguousarray(coefficients, np.float64)
     return Light(coefficients, parts, warnings, digest_arrays(coefficients))
+
+
+def light_texels(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, size: int,
+                 environment_override: str | PathLike[str] | None = None, rotate_degrees: float = 0.0,
+                 use_scene_lights: bool = True, name_lamps: bool = True) -> Light:
+    """The scene's light as mean radiance (6 size^2, 3) of a cubemap's texels. Arguments and errors as for
+    `light_coefficients`; nothing rings, so there is no window, and no part is truncated: what is finer than a texel is
+    averaged over it."""
+    environment = _environment(scene, depsgraph, environment_override)
+    warnings = list(environment.warnings)
+    rotation = world_rotation(rotate_degrees) @ environment.rotation  # small
+    texels = environment.projected.texels(size)
+    if np.abs(rotation - np.eye(3)).max() > 1e-7:
+        texels = Turn(size, rotation)(texels)
+    texels = texels * environment.scale
+    for lamp in read_suns(depsgraph, warnings, name_lamps) if use_scene_lights else ():
+        texels = texels + sun_texels(lamp.direction, lamp.irradiance, lamp.angle, size)
+    texels = np.ascontiguousarray(texels, np.float64)
+    return Light(texels, [], warnings, digest_arrays(texels))
+
+
+def distant_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, columns: Iterable[Columns],
+                  environment_override: str | PathLike[str] | None = None, rotate_degrees: float = 0.0,
+                  use_scene_lights: bool = True, window: bool = False, name_lamps: bool = True,
+                  ) -> tuple[DistantLight, list[str], Hashable]:
+    """The scene's distant light for bakes of all these columns, warnings, and a signature that is equal exactly if the
+    light is. Arguments and errors as for `light_coefficients`."""
+    columns = list(columns)
+    order = max((found.order for found in columns), default=0)
+    sizes = sorted({found.cubemap for found in columns} - {0})
+    rest = (environment_override, rotate_degrees, use_scene_lights)
+    harmonics = light_coefficients(scene, depsgraph, order, *rest, window, name_lamps) if order else None
+    texels = {size: light_texels(scene, depsgraph, size, *rest, name_lamps) for size in sizes}
+    all_found = [found for found in (harmonics, *texels.values()) if found is not None]
+    warnings = dict.fromkeys(line for found in all_found for line in found.warnings)
+    light = DistantLight(None if harmonics is None else harmonics.coefficients,
+                         {size: found.coefficients for size, found in texels.items()})
+    return light, list(warnings), (order, *sizes, *(found.signature for found in all_found))
 
 
 def environment_picture(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph,

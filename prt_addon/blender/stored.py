@@ -156,20 +156,23 @@ def stored_header(scene_object: bpy.types.Object) -> dict | None:
     return None if mesh is None else container.parse_header(mesh[container.HEADER_PROPERTY], scene_object.name)
 
 
-def transform_since_bake(scene_object: bpy.types.Object, header: dict) -> NDArray[np.float64]:
-    """(4, 4) from world space at bake time to world space now: identity where the object was not moved."""
+def transform_since_bake(scene_object: bpy.types.Object, header: dict,
+                         matrix: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """(4, 4) from world space at bake time to world space now: identity where the object was not moved. matrix: (4, 4),
+    where an instance of it stands."""
     then = _header_matrix(header, scene_object.name)
-    now = np.array(scene_object.matrix_world, np.float64)
+    now = np.array(scene_object.matrix_world if matrix is None else matrix, np.float64)
     return np.eye(4) if _same_place(now, then) else now @ np.linalg.inv(then)  # small
 
 
 def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
-          surroundings: dict[str, str] | None = None) -> str | None:
+          surroundings: dict[str, str] | None = None, matrix: NDArray[np.float64] | None = None) -> str | None:
     """Why an object's bake no longer fits the scene, as a clause for the user; None while it does or without a bake.
 
     A bake fits as long as everything keeps its place relative to everything else (`transform_since_bake` tells where it
     went). surroundings: of now, from `fingerprint.surroundings`, if what else moved shall count too; without them a
-    move of the object alone makes it stale. Raises StorageError where the header can't be read.
+    move of the object alone makes it stale. matrix: as for `transform_since_bake`. Raises StorageError where the header
+    can't be read.
     """
     header = stored_header(scene_object)
     if header is None:
@@ -180,7 +183,7 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
         return "its mesh or modifiers changed since the bake"
     if digests.get("materials") != material_digest(used_materials(scene_object)):
         return "its materials changed since the bake"
-    moved, then = transform_since_bake(scene_object, header), digests.get("surroundings")
+    moved, then = transform_since_bake(scene_object, header, matrix), digests.get("surroundings")
     stays = np.array_equal(moved, np.eye(4))
     if not stays and (then is None or surroundings is None or similarity(moved) is None):
         return MOVED

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BadScene, PRTError
+from ..lighting.cubemap_light import environment_texels
 from ..lighting.environment import band_energies, check_finite, load_equirectangular, project, total_energy
 from ..lighting.reference_light import REFERENCE_WIDTH, averaged
 from .nodes import constant_of, path_of, reachable, shown_images, signature, source_of
@@ -28,16 +29,29 @@ STRONGEST = 1e30  # products with transfer still fit single precision
 @dataclass(frozen=True)
 class ProjectedImage:
     """What is kept of an equirectangular image: coefficients (100, 3) at the highest order, its total energy (integral
-    of squared radiance, channels summed), and the image averaged to the width of references."""
+    of squared radiance, channels summed), and the image averaged to the width of references. Cubemaps are made of the
+    image itself, read again by `make`, and kept in `cubemaps` by their size."""
 
     coefficients: NDArray[np.float64]
     energy: float
     small: NDArray[np.float32]
+    make: Callable[[], NDArray[np.float32]]
+    cubemaps: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     @staticmethod
-    def of(image: NDArray[np.float32]) -> ProjectedImage:
+    def of(make: Callable[[], NDArray[np.float32]]) -> ProjectedImage:
         """Project an image (height, width, 3), linear, top row first."""
-        return ProjectedImage(project(image, HIGHEST_ORDER), total_energy(image), averaged(image, REFERENCE_WIDTH))
+        image = make()
+        return ProjectedImage(project(image, HIGHEST_ORDER), total_energy(image), averaged(image, REFERENCE_WIDTH),
+                              make)
+
+    def texels(self, size: int) -> NDArray[np.float64]:
+        """Mean radiance (6 size^2, 3) in the texels of a cubemap, read-only."""
+        if size not in self.cubemaps:
+            texels = environment_texels(self.make(), size)
+            texels.setflags(write=False)
+            self.cubemaps[size] = texels
+        return self.cubemaps[size]
 
     def truncation(self, order: int) -> float:
         """Share of the energy, 0..1, that the first `order` bands do not hold."""
@@ -267,12 +281,12 @@ def _checked_render(scene: bpy.types.Scene, world: bpy.types.World, width: int) 
 
 
 def _projected(key: Hashable, make: Callable[[], NDArray[np.float32]]) -> ProjectedImage:
-    """`ProjectedImage.of(make())`, kept under the key; a key of None is not kept."""
+    """`ProjectedImage.of(make)`, kept under the key; a key of None is not kept."""
     if key is None:
-        return ProjectedImage.of(make())
+        return ProjectedImage.of(make)
     if key not in _cache:
-        found = ProjectedImage.of(make())
+        found = ProjectedImage.of(make)
         while len(_cache) >= CACHED:
             del _cache[next(iter(_cache))]
         _cache[key] = found
-    return _cache[key]
+    return replace(_cache[key], make=make)  # what it was first read from may be gone

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..basis.spherical_harmonics import rotate
+from ..lighting.distant_light import DistantColumns, DistantLight
 from ..lighting.local_lights import LocalLight
 
 # Relative deviation from a right-angled frame that single precision leaves in a product of a few transforms.
@@ -39,9 +39,10 @@ def is_turned(moved: ArrayLike) -> bool:
     return found is not None and bool(np.abs(found[1] - np.eye(3)).max() > UNTURNED)
 
 
-def distant_light_in(coefficients: NDArray[np.float64], moved: ArrayLike) -> NDArray[np.float64]:
-    """Coefficients (n, 3) of distant light as the bake sees it; as they are for other than similar moves."""
-    return rotate(coefficients, similarity(moved)[1].T) if is_turned(moved) else coefficients
+def distant_light_in(light: DistantLight, columns: DistantColumns, moved: ArrayLike) -> NDArray[np.float64] | None:
+    """Distant light (n, 3) in a bake's columns as the bake sees it; as it is for other than similar moves, None where
+    there is none."""
+    return light.in_columns(columns, similarity(moved)[1].T if is_turned(moved) else None)
 
 
 def lamp_in(lamp: LocalLight, moved: ArrayLike) -> LocalLight:

@@ -16,10 +16,12 @@ from ..errors import StorageError
 from ..lighting.light_cloud import LightCloud
 from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..relighting.lamp_highlights import LampSurfaces
-from .columns import LIT_SURFACES, Columns, cloud_part, read_columns
+from .columns import LIT_SURFACES, Columns, cloud_part, cubemap_size, read_columns
 from .lamp_surfaces import read_lamp_surfaces
 
-SCHEMA = 3  # highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too
+# Highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too; 4: of a
+# cubemap, too.
+SCHEMA = 4
 CLUSTER_ATTRIBUTE = "prt_cluster"
 WEIGHTS_ATTRIBUTE = "prt_weights_"
 ALBEDO_ATTRIBUTE = "prt_albedo"
@@ -96,8 +98,8 @@ class BakedTransfer:
     def lighting_basis(self) -> Columns:
         """What the columns stand for."""
         part = cloud_part(self.header.get("columns"))
-        cloud = 0 if part is None else int(part["columns"])
-        return Columns(math.isqrt(self.bases.shape[3] - cloud), cloud)
+        cloud, size = 0 if part is None else int(part["columns"]), cubemap_size(self.header.get("columns"))
+        return Columns(0 if size else math.isqrt(self.bases.shape[3] - cloud), cloud, size)
 
     @property
     def cluster_zone(self) -> NDArray[np.int32] | None:
@@ -111,7 +113,7 @@ def make_header(shape: tuple[int, ...], columns: dict[str, Any], rows: dict[str,
 
     shape: of the bases (clusters, vectors + 1, rows, columns, channels).
     """
-    schema = 3 if cloud_part(columns) else 1 if rows.get("kind") == "constant" else 2
+    schema = 4 if cubemap_size(columns) else 3 if cloud_part(columns) else 1 if rows.get("kind") == "constant" else 2
     return {
         "schema": schema,
         "shape": [int(s) for s in shape],

@@ -57,7 +57,7 @@ def direct_transfer(tracer: Tracer, receivers: ReceiverSet, directions: NDArray[
 
     def trace(task: _Task) -> tuple:
         place = task.block.receivers
-        traced = _cosine_visibility(tracer if shadow_rays else None, receivers, place, task.directions)
+        traced = cosine_visibility(tracer if shadow_rays else None, receivers, place, task.directions)
         return traced, plain and plain.sample(receivers, place, task.directions, task.weights, *traced[:2])
 
     for task, ((cosines, visible, rays), sample) in tracer.map_in_order(trace, tasks):
@@ -84,7 +84,7 @@ def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDA
                         np.ascontiguousarray(basis[:, chunk]), weights[chunk])
 
 
-def _cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
+def cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slice, directions: NDArray[np.float32],
                        ) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     """Clamped cosines (d, b), the same weighted by what is seen, and the number of rays.
 

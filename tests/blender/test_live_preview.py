@@ -128,3 +128,26 @@ def test_nothing_is_read_again_while_nothing_changes(cubes: list[bpy.types.Objec
     follow()
     assert {name: shown.baked for name, shown in live.shown.items()} == before and listed() == {
         "Statue": False, "Wall": False}
+
+
+def test_an_instanced_collection_shows_its_bakes(cubes: list[bpy.types.Object]) -> None:
+    """The whole set through an empty: lit where it stands, turned light and all; beside the originals all are stale."""
+    scene, held = bpy.context.scene, bpy.data.collections.new("Set")
+    for found in list(scene.collection.objects):
+        held.objects.link(found)
+    empty = bpy.data.objects.new("Place", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", held
+    scene.collection.objects.link(empty)
+    turn = Matrix.Translation((5.0, 9.0, 1.0)) @ Matrix.Rotation(0.7, 4, "Z")
+    empty.matrix_world = turn
+    follow()
+    assert listed() == dict.fromkeys(("Statue", "Wall", "Place/Statue", "Place/Wall"), True)
+    for found in list(held.objects):
+        scene.collection.objects.unlink(found)
+    live = follow()
+    assert listed() == {"Place/Statue": False, "Place/Wall": False}
+    assert all(np.allclose(shown.moved, np.array(turn), atol=1e-5) for shown in live.shown.values())
+    assert live.owners == {"Place"}
+    held.objects.unlink(cubes[2])
+    follow()
+    assert listed() == {"Place/Statue": True, "Place/Wall": True}

@@ -19,7 +19,8 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
     sys.modules["prt"].__path__ = [str(ROOT)]
 
 # Of the preview alone, or turned into a field of another name.
-NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection"}
+NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection",
+             "compare_samples", "compare_percentage"}
 
 
 @pytest.fixture
@@ -143,7 +144,7 @@ class Drawn:
 
 @pytest.mark.parametrize(("lighting", "basis"), [("environment", None), ("local", "cloud"), ("both", "surfaces")])
 def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: bpy.types.PropertyGroup) -> None:
-    from prt.panels import bake, preview
+    from prt.panels import bake, check, preview
     from prt.panels import settings as expert
 
     settings.lighting, settings.targets = lighting, "collection"
@@ -154,7 +155,7 @@ def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: b
                                     selected_objects=[], region=types.SimpleNamespace(width=300),
                                     preferences=types.SimpleNamespace(system=types.SimpleNamespace(ui_scale=1.0)))
     for panel in (bake.PRT_PT_bake, expert.PRT_PT_rays, expert.PRT_PT_highlights, expert.PRT_PT_local_lights,
-                  expert.PRT_PT_compression, preview.PRT_PT_preview):
+                  expert.PRT_PT_compression, preview.PRT_PT_preview, check.PRT_PT_check):
         if "poll" not in vars(panel) or panel.poll(context):
             drawing = types.SimpleNamespace(layout=Drawn(found))
             drawing.column = lambda context, panel=panel, drawing=drawing: panel.column(drawing, context)

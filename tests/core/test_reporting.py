@@ -21,6 +21,7 @@ from prt_addon.reporting.headline import headline
 from prt_addon.reporting.html_report import render
 from prt_addon.reporting.report_file import HIGHLIGHT_ERROR_NAMES, problem_of, read_report, write_report
 from prt_addon.reporting.stages import StageTimer, reset_peak_bytes
+from prt_addon.reporting.summary import summary
 
 
 def made_up_report() -> dict[str, Any]:
@@ -189,6 +190,33 @@ def test_peak_memory_belongs_to_its_stage() -> None:
     assert large - before > 0.8 * size
     if reset_peak_bytes():  # elsewhere the peak is the process's and can only grow
         assert large - after > 0.8 * size
+
+
+def test_summary_tells_time_errors_and_what_was_left_out() -> None:
+    """In this order; shares of stages add up to the bake's time, the largest error of a part fills its bar."""
+    report = with_highlights()
+    lines = summary(report)
+    assert [line.kind for line in lines] == sorted((line.kind for line in lines), key=lambda kind: {
+        "fact": 0, "stage": 1, "heading": 2, "error": 2, "left_out": 3}[kind])
+    stages = [line for line in lines if line.kind == "stage"]
+    told = [stage for stage in report["stages"] if stage["seconds"] >= 0.01 * report["seconds"]]
+    assert [line.share for line in stages] == [stage["seconds"] / report["seconds"] for stage in told]
+    headings = [n for n, line in enumerate(lines) if line.kind == "heading"]
+    for start in headings:
+        errors = [line.share for line in lines[start + 1:] if line.kind == "error"][:2]
+        assert 0.0 < errors[0] <= 1.0 and lines[start + 1].text.startswith("All together")
+    assert sum(line.kind == "error" for line in lines) == len(report["errors"]) + len(report["highlight_errors"])
+    for item in report["left_out"]:
+        assert any(item["what"] in line.text and item["why"] in line.text for line in lines)
+    assert not any("\t" in line.text or "\n" in line.text for line in lines)
+
+
+def test_summary_of_numbers_that_were_not_finite() -> None:
+    report = made_up_report()
+    report["seconds"], report["rays"], report["stages"][0]["seconds"] = None, None, None
+    report["errors"]["basis"]["relative_rms"] = None
+    texts = [line.text for line in summary(report)]
+    assert texts[0].startswith("unknown") and not any("None" in text for text in texts)
 
 
 def test_written_report_reads_back(tmp_path: Path) -> None:

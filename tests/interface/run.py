@@ -34,6 +34,7 @@ SCRIPTS = {
     "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
     "presets": ("presets_in_blender.py", "make_scene.py"),
+    "compare": ("compare_in_blender.py", "make_scene.py"),
     "views": ("views_in_blender.py", "make_views.py"),
     "changes": ("changes_in_blender.py", "make_views.py"),
 }

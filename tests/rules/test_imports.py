@@ -21,7 +21,7 @@ FOLDERS = ("scene", "tracing", "basis", "transport", "compression", "lighting", 
            "baking", "blender")
 GROUND_FLOOR = ("errors", "linear_algebra", "unlocked_blas")
 EVERYWHERE = {"numpy", "scipy"}
-BLENDER = {"bpy", "blf", "mathutils", "bmesh", "bpy_extras", "addon_utils", "idprop"}
+BLENDER = {"bpy", "blf", "imbuf", "mathutils", "bmesh", "bpy_extras", "addon_utils", "idprop"}
 GPU = {"gpu", "gpu_extras"}
 # Wheel -> the folders that may import it, lazily.
 WHEELS = {"embreex": ("prt_addon/tracing/",), "xatlas": ("prt_addon/scene/receivers",),

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Transfer too large for memory: arrays of whole columns, on disk where a budget says so.
+
+Columns come first, (columns, receivers): a fill writes one direction for many receivers, a bounce and a principal
+component analysis read whole columns, and each of these is one run of the file.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PRTError
+
+Single = NDArray[np.float32]
+
+# Columns in memory at once: 256 of 50,000 receivers are 51 MB.
+COLUMNS_AT_ONCE = 256
+
+
+def column_array(columns: int, receivers: int, budget: int | None = None, folder: Path | None = None) -> Single:
+    """Zeros (columns, receivers) float32: in memory where they take at most `budget` bytes (None: always), else in a
+    nameless file of `folder` (None: the system's for temporary files), which goes away with the array.
+
+    Raises PRTError where the disk has no room for it.
+    """
+    size = 4 * columns * receivers
+    if budget is None or size <= budget or not size:
+        return np.zeros((columns, receivers), np.float32)
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.truncate(size)
+            return np.memmap(file, np.float32, "r+", shape=(columns, receivers))
+    except OSError as error:
+        raise PRTError(str(folder or tempfile.gettempdir()), f"{size / 1e9:.1f} GB of transfer can't be written there "
+                       f"({error.strerror or error})", "Free some disk space, or choose a smaller cubemap") from error
+
+
+def column_blocks(columns: int, at_once: int = COLUMNS_AT_ONCE) -> Iterator[slice]:
+    """Slices of all columns, `at_once` each."""
+    for start in range(0, columns, at_once):
+        yield slice(start, min(start + at_once, columns))
