@@ -170,12 +170,12 @@ def light_moves(region: object, live: object) -> Generator[float, None, list[flo
     drawn: list[tuple[float, object]] = []
 
     def after() -> None:
-        drawn.append((time.perf_counter(), live._live.light is not None and live._live.light.tobytes()))
+        drawn.append((time.perf_counter(), live._live.signature))
 
     handle, result = bpy.types.SpaceView3D.draw_handler_add(after, (), "WINDOW", "POST_PIXEL"), []
     sun = bpy.data.objects["Sun"]
     for number in range(LIGHT_MOVES):
-        before = live._live.light.tobytes()
+        before = live._live.signature
         drawn.clear()
         sun.rotation_euler[2] += 0.1
         started = time.perf_counter()

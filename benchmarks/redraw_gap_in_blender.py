@@ -11,10 +11,12 @@ from collections.abc import Generator
 from pathlib import Path
 
 import bpy
+from mathutils import Quaternion
 
 OUTPUT, SCENE, THREADS, SECONDS = sys.argv[sys.argv.index("--") + 1:][:4]
 # A long stage of shadows, in which all threads work; the bake is cancelled after some seconds of it.
 BAKE = "directions=200000, error_receivers=0, threads={}"
+TURN = Quaternion((0.0, 0.0, 1.0), 0.02)
 drawn: list[float] = []
 gaps: dict[str, list[float]] = {}
 
@@ -35,7 +37,7 @@ def orbit(seconds: float, name: str, baking: bool) -> Generator[float]:
             last = len(drawn)
             _, area, region = view()
             space = area.spaces.active.region_3d
-            space.view_rotation.rotate(bpy.app.driver_namespace["turn"])
+            space.view_rotation.rotate(TURN)
             region.tag_redraw()
         if baking:
             assert bpy.context.window_manager.prt.running, bpy.context.window_manager.prt.message
@@ -44,9 +46,6 @@ def orbit(seconds: float, name: str, baking: bool) -> Generator[float]:
 
 
 def steps() -> Generator[float]:
-    from mathutils import Quaternion
-
-    bpy.app.driver_namespace["turn"] = Quaternion((0.0, 0.0, 1.0), 0.02)
     window, area, region = view()
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.wm.open_mainfile(filepath=SCENE, load_ui=False)

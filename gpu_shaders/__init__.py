@@ -7,10 +7,12 @@ Reading order is data order:
                      they changed. Never imports gpu or bpy.
     hemisphere_glsl.py   pure text: the functions of the view as GLSL.
     programs.py      GLSL files -> the programs (cached; released by `programs.release`).
+    image_textures.py   vertices that carry places in image textures, and the images as Blender holds them
     draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
                      when the data's signature changes, relit when the light's changes, else only drawn.
+    overlay.py       marks over the picture: points, lines, triangles, and the legend of false colours
     occluders.py     depth of surfaces that are not ours, where Blender leaves none.
-    viewport.py      the two draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
+    viewport.py      the draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
     offscreen.py     `draw_camera` for background mode and the bpy wheel, `write_png`.
 
 The GLSL:
@@ -19,7 +21,8 @@ The GLSL:
     exit_radiance.comp.glsl    once per light change: exit radiance of every point and row, into a texture
     depth.vert/frag.glsl       surfaces that only hide others
     surface.vert.glsl          once per frame: fetches a point's exit radiance by gl_VertexID
-    surface.frag.glsl          multiplies the interpolated radiance by the interpolated albedo
+    albedo.glsl                a fragment's albedo: from the image of its material, else interpolated
+    surface.frag.glsl          multiplies the interpolated radiance by it
     view_surface.vert.glsl     the same for view-dependent transfer: all rows of the point, and its local view
     view_surface.frag.glsl     sums the interpolated rows times spherical harmonics of the local view
 
@@ -34,5 +37,6 @@ Diffuse bakes keep the cheap program. Where the view counts, every row is interp
 view are evaluated per fragment. Where the view comes from is found in the transform to clip space itself
 (`render_data.viewer_of`), in the space of the bake: perspective, orthographic, and objects moved since, alike.
 
-Colours are scene-linear from end to end; the view transform is Blender's own.
+Colours are scene-linear from end to end; the view transform is Blender's own. False colours are drawn into the buffer
+of the overlays, which it does not touch.
 """

@@ -8,6 +8,7 @@ while the encoding, the mesh and the texture of exit radiances live as long as t
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
 
 import gpu
 import numpy as np
@@ -15,7 +16,9 @@ from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.relighting.exit_radiance import baked_constants
-from . import programs
+from ..prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
+from . import image_textures, programs
+from .image_textures import TexturedVertices, textured_vertices
 from .render_data import (
     DrawItem,
     RenderData,
@@ -50,7 +53,10 @@ class ObjectDrawing:
 
     def __init__(self, data: RenderData) -> None:
         self.data = data
-        self._batch = _make_batch(data)
+        self._vertices = _make_vertices(data)
+        self._batch = _make_batch(self._vertices, data.triangles)
+        self._textured: list[_TexturedPart] = []
+        self._textures_key: Hashable = None
         self._encoding = make_texture(data.encoding)
         self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
         self._colours: gpu.types.GPUTexture | None = None
@@ -81,7 +87,8 @@ class ObjectDrawing:
         """Draw (points, 3) colours in place of computed radiances."""
         self._colours = make_texture(texture_values(colours))
         if self.data.functions and self._plain_batch is None:
-            self._plain_batch = _make_batch(plain_surface(self.data))
+            plain = plain_surface(self.data)
+            self._plain_batch = _make_batch(_make_vertices(plain), plain.triangles)
 
     def add_direct(self, values: NDArray[np.float32] | None) -> None:
         """Direct light (points, rows, 3), for unit albedo in row 0, to add from now on; None for none."""
@@ -93,6 +100,24 @@ class ObjectDrawing:
         self._direct_values = values
         self._direct = None if values is None else make_texture(texture_values(values.reshape(-1, 3)))
 
+    def show_textures(self, textures: SurfaceTextures | None) -> None:
+        """Take the albedo from images from now on; None for that of the points."""
+        key = None if textures is None else textures.key
+        if key == self._textures_key:
+            return
+        self._textures_key, self._textured = key, []
+        if textures is None:
+            return
+        if len(textures.use) != len(self.data.triangles):
+            raise ValueError(f"textures of {len(textures.use)} triangles do not fit {len(self.data.triangles)}")
+        found = textured_vertices(self.data, textures)
+        vertices = _make_vertices(self.data, found)
+        for number in np.unique(textures.use):
+            mine = textures.use == number
+            plain = _make_batch(self._vertices, self.data.triangles[mine])
+            self._textured.append(_TexturedPart(plain) if number < 0 else _TexturedPart(
+                plain, textures.uses[number], _make_batch(vertices, found.triangles[mine])))
+
     def exit_radiances(self) -> NDArray[np.float32]:
         """The exit radiances on the GPU for unit albedo, (points, rows, 3). Waits for the GPU: for tests and export."""
         count = self.data.points * self.data.rows
@@ -103,8 +128,23 @@ class ObjectDrawing:
 
         exposure: factor on the colours. use_albedo: multiply by the surface's albedo; without, unit albedo.
         """
+        if self._colours is not None:
+            self._draw_batch(self._plain_batch or self._batch, transform, exposure, use_albedo)
+            return
+        for part in self._textured or (_TexturedPart(self._batch),):
+            image = image_textures.texture_of(part.use) if part.use is not None and use_albedo else None
+            if image is None:
+                self._draw_batch(part.plain, transform, exposure, use_albedo)
+            else:
+                self._draw_batch(part.batch, transform, exposure, use_albedo, image)
+
+    def _draw_batch(self, batch: gpu.types.GPUBatch, transform: NDArray[np.floating], exposure: float, use_albedo: bool,
+                    image: tuple[gpu.types.GPUTexture, tuple[float, ...]] | None = None) -> None:
+        """Draw some of the triangles. image: of their albedo, see `image_textures`."""
         depends_on_view = bool(self.data.functions) and self._colours is None
-        program = programs.view_surface(self.data.functions) if depends_on_view else programs.surface()
+        textured = image is not None
+        program = (programs.view_surface(self.data.functions, textured) if depends_on_view else
+                   programs.surface(textured))
         program.bind()
         exit_values = self._exit if self._colours is None else self._colours
         direct = self._direct if self._colours is None else None
@@ -116,24 +156,47 @@ class ObjectDrawing:
             program.uniform_float("viewer", viewer_of(transform).tolist())
         program.uniform_float("exposure", exposure)
         program.uniform_float("albedo_share", 1.0 if use_albedo else 0.0)
-        batch = self._batch if self._colours is None or self._plain_batch is None else self._plain_batch
+        if image is not None:
+            program.uniform_sampler("albedo_image", image[0])
+            program.uniform_float("texture_factor", image[1])
         batch.draw(program)
 
 
-def _make_batch(data: RenderData) -> gpu.types.GPUBatch:
-    """The mesh with its albedo, and its frames where the view counts, as an indexed batch; gl_VertexID is the point's
-    number where it does not."""
+@dataclass(frozen=True, eq=False)
+class _TexturedPart:
+    """Triangles of one texture, and the batch that draws them with the points' albedo; without use they have none."""
+
+    plain: gpu.types.GPUBatch
+    use: TextureUse | None = None
+    batch: gpu.types.GPUBatch | None = None
+
+
+def _make_vertices(data: RenderData, textured: TexturedVertices | None = None) -> gpu.types.GPUVertBuf:
+    """The vertices with their albedo or places in textures, and their frames where the view counts. gl_VertexID is the
+    point's number where neither is."""
     attributes = {"position": data.positions, "albedo": data.albedo}
     if data.functions:
         numbers = np.stack([data.receivers, data.turns], axis=1).astype(np.float32)  # exact up to 2^24 points
         attributes |= {"normal": data.normals, "tangent": data.tangents, "receiver_and_turn": numbers}
+    if textured is not None:
+        del attributes["albedo"]
+        attributes = {name: np.ascontiguousarray(values[textured.vertices]) for name, values in attributes.items()}
+        attributes["place"] = textured.places
+        if not data.functions:
+            attributes["receiver"] = textured.vertices.astype(np.float32)[:, None]
     layout = gpu.types.GPUVertFormat()
     for name, values in attributes.items():
         layout.attr_add(id=name, comp_type="F32", len=values.shape[1], fetch_mode="FLOAT")
-    vertices = gpu.types.GPUVertBuf(layout, len(data.positions))
+    vertices = gpu.types.GPUVertBuf(layout, len(attributes["position"]))
     for name, values in attributes.items():
         vertices.attr_fill(name, values)
-    return gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=gpu.types.GPUIndexBuf(type="TRIS", seq=data.triangles))
+    return vertices
+
+
+def _make_batch(vertices: gpu.types.GPUVertBuf, triangles: NDArray[np.int32]) -> gpu.types.GPUBatch:
+    """Triangles (t, 3) of vertices as an indexed batch."""
+    elements = gpu.types.GPUIndexBuf(type="TRIS", seq=np.ascontiguousarray(triangles, np.int32))
+    return gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=elements)
 
 
 class DrawingCache:
@@ -161,7 +224,7 @@ class DrawingCache:
             for item in items:
                 factor = item.exposure * (STALE_DIMMING if item.stale else 1.0)
                 drawing = self._prepared(item)
-                drawing.draw(clip_transform(view_projection, item.matrix), factor, item.heat is None)
+                drawing.draw(clip_transform(view_projection, item.matrix), factor, item.is_lit)
         finally:
             gpu.state.depth_test_set(depth_test)
             gpu.state.depth_mask_set(depth_mask)
@@ -175,13 +238,14 @@ class DrawingCache:
             self._lights.pop(item.key, None)
         light = light_signature(item)
         if self._lights.get(item.key) != light:
-            if item.heat is None:
+            if item.is_lit:
                 coefficients = matching_light(item.light, drawing.data.columns)
                 drawing.relight(baked_constants(item.baked, coefficients))
             else:
-                drawing.show_colours(heat_colours(item.heat))
+                drawing.show_colours(heat_colours(item.heat) if item.colours is None else item.colours.values)
             self._lights[item.key] = light
         drawing.add_direct(item.direct)
+        drawing.show_textures(item.textures)
         return drawing
 
     def keep_only(self, keys: set[Hashable]) -> None:

@@ -41,15 +41,17 @@ def exit_radiance() -> gpu.types.GPUShader:
 
 
 @functools.cache
-def surface() -> gpu.types.GPUShader:
-    """The program that draws a lit surface: see surface.vert.glsl and surface.frag.glsl."""
-    varyings = gpu.types.GPUStageInterfaceInfo("prt_surface_varyings")
+def surface(textured: bool = False) -> gpu.types.GPUShader:
+    """The program that draws a lit surface: see surface.vert.glsl and surface.frag.glsl. textured: its albedo is an
+    image's."""
+    varyings = gpu.types.GPUStageInterfaceInfo(f"prt_surface_varyings{'_textured' if textured else ''}")
     varyings.smooth("VEC3", "unit_radiance")
-    varyings.smooth("VEC3", "surface_albedo")
     info = gpu.types.GPUShaderCreateInfo()
     info.define("TEXTURE_WIDTH", str(TEXTURE_WIDTH))
     info.vertex_in(0, "VEC3", "position")
-    info.vertex_in(1, "VEC3", "albedo")
+    _add_albedo(info, varyings, textured, 1)
+    if textured:
+        info.vertex_in(2, "FLOAT", "receiver")
     info.vertex_out(varyings)
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.sampler(0, "FLOAT_2D", "exit_values")
@@ -59,7 +61,7 @@ def surface() -> gpu.types.GPUShader:
     info.push_constant("FLOAT", "exposure")
     info.push_constant("FLOAT", "albedo_share")
     info.vertex_source(_source("texel_layout.glsl", "surface.vert.glsl"))
-    info.fragment_source(_source("surface.frag.glsl"))
+    info.fragment_source(_source("albedo.glsl", "surface.frag.glsl"))
     return gpu.shader.create_from_info(info)
 
 
@@ -75,33 +77,48 @@ def depth_alone() -> gpu.types.GPUShader:
     return gpu.shader.create_from_info(info)
 
 
+def _add_albedo(info: gpu.types.GPUShaderCreateInfo, varyings: gpu.types.GPUStageInterfaceInfo, textured: bool,
+                slot: int) -> None:
+    """Declare where albedo.glsl takes its colour from: the vertices, by an attribute in a slot, or an image."""
+    if textured:
+        info.define("TEXTURED")
+        info.vertex_in(slot, "VEC2", "place")
+        varyings.smooth("VEC2", "texture_place")
+        info.sampler(2, "FLOAT_2D", "albedo_image")
+        info.push_constant("VEC4", "texture_factor")
+    else:
+        info.vertex_in(slot, "VEC3", "albedo")
+        varyings.smooth("VEC3", "surface_albedo")
+
+
 def sees_viewer(functions: tuple[int, ...]) -> bool:
     """Whether some function is not constant. Where none is, nothing of the viewer is declared: see above."""
     return any(functions)
 
 
 @functools.cache
-def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
+def view_surface(functions: tuple[int, ...], textured: bool = False) -> gpu.types.GPUShader:
     """The program that draws a lit surface whose radiance depends on the view: see view_surface.vert.glsl.
 
-    functions: of the view, one for each row but the first. Raises PRTError where the driver passes too few numbers
-    from vertices to fragments.
+    functions: of the view, one for each row but the first; textured: its albedo is an image's. Raises PRTError where
+    the driver passes too few numbers from vertices to fragments.
     """
-    names = ["diffuse_radiance", *hemisphere_glsl.row_names(functions), "surface_albedo"]
+    names = ["diffuse_radiance", *hemisphere_glsl.row_names(functions)]
     names += ["local_view"] if sees_viewer(functions) else []
     most = gpu.capabilities.max_varying_floats_get() // 4  # each takes a slot of four
-    if len(names) > most:
+    if len(names) + 1 > most:  # and that of the albedo
         raise PRTError("the preview", f"the graphics driver passes {most} values to a pixel, this bake needs "
-                       f"{len(names)}", "Bake with fewer functions of the view")
-    varyings = gpu.types.GPUStageInterfaceInfo(f"prt_view_{len(functions)}_varyings")
+                       f"{len(names) + 1}", "Bake with fewer functions of the view")
+    varyings = gpu.types.GPUStageInterfaceInfo(f"prt_view_{len(functions)}_varyings{'_textured' if textured else ''}")
     for name in names:
         varyings.smooth("VEC3", name)
     info = gpu.types.GPUShaderCreateInfo()
     info.define("TEXTURE_WIDTH", str(TEXTURE_WIDTH))
     info.define("ROWS", str(len(functions) + 1))
-    for slot, name in enumerate(("position", "albedo", "normal", "tangent")):
+    for slot, name in enumerate(("position", "normal", "tangent")):
         info.vertex_in(slot, "VEC3", name)
-    info.vertex_in(4, "VEC2", "receiver_and_turn")
+    info.vertex_in(3, "VEC2", "receiver_and_turn")
+    _add_albedo(info, varyings, textured, 4)
     info.vertex_out(varyings)
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.sampler(0, "FLOAT_2D", "exit_values")
@@ -117,7 +134,7 @@ def view_surface(functions: tuple[int, ...]) -> gpu.types.GPUShader:
     fetch += hemisphere_glsl.add_direct_rows(functions)
     turn = hemisphere_glsl.turn_rows(functions)
     info.vertex_source("\n".join([_source("texel_layout.glsl"), fetch, turn, _source("view_surface.vert.glsl")]))
-    info.fragment_source("\n".join([total, _source("view_surface.frag.glsl")]))
+    info.fragment_source("\n".join([total, _source("albedo.glsl", "view_surface.frag.glsl")]))
     return gpu.shader.create_from_info(info)
 
 

@@ -19,6 +19,7 @@ from ..prt_addon.errors import BadScene
 from . import hemisphere_glsl
 
 if TYPE_CHECKING:
+    from ..prt_addon.scene.surface_textures import SurfaceTextures
     from ..prt_addon.storage.container import BakedTransfer
 
 # Turn of frames within a triangle, in radians, up to which blending across it shows nothing (functions turn by up to
@@ -42,6 +43,7 @@ class DrawItem:
         Never changed in place: another array means other light.
     exposure: factor on the radiance. stale: drawn dimmed, because the object was edited after its bake.
     heat: (points,) in 0..1 shown as false colours in place of the radiance, or None.
+    colours: false colours that are no heat, or None. textures: images that replace the albedo of points, or None.
     """
 
     key: Hashable
@@ -52,6 +54,20 @@ class DrawItem:
     stale: bool = False
     heat: NDArray[np.floating] | None = None
     direct: NDArray[np.float32] | None = None
+    colours: FalseColours | None = None
+    textures: SurfaceTextures | None = None
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether light is shown, not false colours."""
+        return self.heat is None and self.colours is None
+
+
+@dataclass(frozen=True, eq=False)
+class FalseColours:
+    """values: (points, 3) float32 scene-linear, shown as they are. Never changed in place."""
+
+    values: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -234,9 +250,9 @@ def transfer_signature(baked: BakedTransfer) -> str:
 
 
 def light_signature(item: DrawItem) -> Hashable:
-    """Changes when the exit radiance must be computed again: the light or the heat values changed."""
+    """Changes when the exit radiance must be computed again: the light or the false colours changed."""
     heat = None if item.heat is None else np.asarray(item.heat, np.float32).tobytes()
-    return np.asarray(item.light, np.float32).tobytes(), heat
+    return np.asarray(item.light, np.float32).tobytes(), heat, item.colours
 
 
 def matching_light(light: ArrayLike, columns: int) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ void main()
 #else
   vec3 view = vec3(0.0, 0.0, 1.0);
 #endif
-  vec3 reflectance = mix(vec3(1.0), surface_albedo, albedo_share);
+  vec3 reflectance = mix(vec3(1.0), fragment_albedo(), albedo_share);
   vec3 radiance = reflectance * diffuse_radiance + sum_rows(view);
   fragment_colour = vec4(max(radiance, vec3(0.0)) * exposure, 1.0);
 }

@@ -15,7 +15,11 @@ void main()
   if (receiver_and_turn.y != 0.0) {
     turn_rows(receiver_and_turn.y);
   }
+#ifdef TEXTURED
+  texture_place = place;
+#else
   surface_albedo = albedo;
+#endif
 #ifdef SEES_VIEWER
   vec3 to_viewer = viewer.xyz - viewer.w * position;
   local_view = vec3(dot(to_viewer, tangent), dot(to_viewer, cross(normal, tangent)), dot(to_viewer, normal));

@@ -27,11 +27,13 @@ import gpu
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Vector
+from numpy.typing import NDArray
 
 from ..prt_addon.errors import PRTError
 from . import programs
 from .draw import DrawingCache
 from .occluders import Occluder, OccluderCache
+from .overlay import NOTHING, Marks, OverlayCache, draw_legend
 from .render_data import DrawItem
 
 SPACE = bpy.types.SpaceView3D
@@ -41,6 +43,7 @@ GetOccluders = Callable[[], Sequence[Occluder]]
 
 
 GetLabels = Callable[[], Sequence[tuple[str, Sequence[float]]]]
+GetMarks = Callable[[], Marks]
 LABEL_SIZE, LABEL_OFFSET = 12, (14, 10)  # in units of the interface's scale
 
 
@@ -50,6 +53,10 @@ def _never_complete() -> bool:
 
 def _no_occluders() -> Sequence[Occluder]:
     return ()
+
+
+def _no_marks() -> Marks:
+    return NOTHING
 
 
 def _no_labels() -> Sequence[tuple[str, Sequence[float]]]:
@@ -78,9 +85,11 @@ class _Viewport:
     is_complete: IsComplete
     get_labels: GetLabels = _no_labels
     get_occluders: GetOccluders = _no_occluders
+    get_marks: GetMarks = _no_marks
     occluders: OccluderCache = field(default_factory=OccluderCache)
     handlers: list[Any] = field(default_factory=list)
     cache: DrawingCache = field(default_factory=DrawingCache)
+    overlays: OverlayCache = field(default_factory=OverlayCache)
     framebuffers: dict[int, gpu.types.GPUFrameBuffer] = field(default_factory=dict)  # by region, within one redraw
     drawn: dict[int, set[Hashable]] = field(default_factory=dict)  # keys of the last redraw by region
     status: ViewportStatus = field(default_factory=lambda: ViewportStatus(enabled=True))
@@ -90,21 +99,24 @@ _active: _Viewport | None = None
 
 
 def enable(get_draw_list: GetDrawList, is_complete: IsComplete = _never_complete,
-           get_labels: GetLabels = _no_labels, get_occluders: GetOccluders = _no_occluders) -> None:
+           get_labels: GetLabels = _no_labels, get_occluders: GetOccluders = _no_occluders,
+           get_marks: GetMarks = _no_marks) -> None:
     """Draw what `get_draw_list()` returns in every 3D viewport from now on. Called again, only the callables change.
 
     get_draw_list runs on every redraw of every region, with bpy.context of that region: it must be cheap, and may
     raise PRTError, which `status()` then shows. is_complete runs after it and says whether the listed objects are the
     only visible surfaces of the region; then they hide each other by their own depth alone. get_labels runs on every
-    redraw, too: short texts and the places in the world (3,) beside which they stand while overlays are shown.
-    get_occluders is asked where Blender leaves no depth: for what else is visible in the region and can be in front.
+    redraw, too: short texts and the places in the world (3,) beside which they stand while overlays are shown; and so
+    does get_marks: what is marked in the scene then, and the legend. get_occluders is asked where Blender leaves no
+    depth: for what else is visible in the region and can be in front.
     """
     global _active
     if _active is not None:
         _active.get_draw_list, _active.is_complete = get_draw_list, is_complete
         _active.get_labels, _active.get_occluders = get_labels, get_occluders
+        _active.get_marks = get_marks
     else:
-        _active = _Viewport(get_draw_list, is_complete, get_labels, get_occluders)
+        _active = _Viewport(get_draw_list, is_complete, get_labels, get_occluders, get_marks)
         for handler, phase in ((_remember_framebuffer, "PRE_VIEW"), (_draw_region, "POST_VIEW"),
                                (_draw_labels, "POST_PIXEL")):
             _active.handlers.append(SPACE.draw_handler_add(handler, (), "WINDOW", phase))
@@ -119,6 +131,7 @@ def disable() -> None:
     for handle in _active.handlers:
         SPACE.draw_handler_remove(handle, "WINDOW")
     _active.cache.clear()
+    _active.overlays.clear()
     _active.occluders.clear()
     _active = None
     programs.release()
@@ -157,6 +170,7 @@ def _draw_region() -> None:
         return
     framebuffer = viewport.framebuffers.pop(region.as_pointer(), None)
     if _sees_through(space.shading):
+        _draw_marks(viewport, space)
         return
     try:
         items = viewport.get_draw_list()
@@ -165,6 +179,13 @@ def _draw_region() -> None:
         viewport.status.objects, viewport.status.error = len(items), ""
     except PRTError as error:  # nobody can catch it here; the panel shows it
         viewport.status.objects, viewport.status.error = 0, str(error)
+    _draw_marks(viewport, space)
+
+
+def _draw_marks(viewport: _Viewport, space: bpy.types.SpaceView3D) -> None:
+    """Draw what is marked in the scene over the picture."""
+    if space.overlay.show_overlays:
+        viewport.overlays.draw(viewport.get_marks().overlays)
 
 
 def _keys_in_use(viewport: _Viewport, region: bpy.types.Region, items: Sequence[DrawItem]) -> set[Hashable]:
@@ -178,12 +199,15 @@ def _keys_in_use(viewport: _Viewport, region: bpy.types.Region, items: Sequence[
 
 
 def _draw_labels() -> None:
-    """POST_PIXEL: write the labels beside their places."""
+    """POST_PIXEL: write the labels beside their places, and the legend."""
     viewport, region, space = _active, bpy.context.region, bpy.context.space_data
     if viewport is None or region is None or not space.overlay.show_overlays:
         return
     scale, font = bpy.context.preferences.system.ui_scale, 0
     sidebars = [other.width for other in bpy.context.area.regions if other.type == "UI" and other.width > 1]
+    legend = None if _sees_through(space.shading) else viewport.get_marks().legend
+    if legend is not None:
+        draw_legend(legend, region, sum(sidebars))
     blf.size(font, LABEL_SIZE * scale)
     blf.enable(font, blf.SHADOW)
     for text, place in viewport.get_labels():
@@ -204,18 +228,29 @@ def _draw_items(viewport: _Viewport, items: Sequence[DrawItem], framebuffer: gpu
     if not items:
         return
     view_projection = np.array(bpy.context.region_data.perspective_matrix, np.float64)
+    if not all(item.is_lit for item in items):  # false colours: the overlays' buffer gets no view transform
+        viewport.status.colour_managed, viewport.status.fallback = True, ""
+        _prepare_depth(viewport, gpu.state.active_framebuffer_get(), view_projection)
+        viewport.cache.draw(items, view_projection)
+        return
     reason = _why_not_usable(framebuffer, bpy.context.region)
     viewport.status.colour_managed, viewport.status.fallback = not reason, reason
     if reason:
         viewport.cache.draw(items, view_projection)
         return
     with framebuffer.bind():
-        complete = viewport.is_complete()
-        if complete or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
-            framebuffer.clear(depth=1.0)
-            if not complete:
-                viewport.occluders.draw(viewport.get_occluders(), view_projection)
+        _prepare_depth(viewport, framebuffer, view_projection)
         viewport.cache.draw(items, view_projection)
+
+
+def _prepare_depth(viewport: _Viewport, framebuffer: gpu.types.GPUFrameBuffer,
+                   view_projection: NDArray[np.float64]) -> None:
+    """Clear the bound framebuffer's depth where it is not the scene's or not needed, and draw what it lacks."""
+    complete = viewport.is_complete()
+    if complete or _depth_is_missing(bpy.context.space_data, bpy.context.scene.render.engine):
+        framebuffer.clear(depth=1.0)
+        if not complete:
+            viewport.occluders.draw(viewport.get_occluders(), view_projection)
 
 
 def _why_not_usable(framebuffer: gpu.types.GPUFrameBuffer | None, region: bpy.types.Region) -> str:

@@ -197,9 +197,10 @@ class BakeSession:
         """Its job folder."""
         return self.claim.folder
 
-    @property
-    def seconds(self) -> float:
-        """Since the start, reading the scene included."""
+    def seconds(self, result: BakeResult) -> float:
+        """Since the start, reading the scene included; of a bake that was complete before, what it took then."""
+        if isinstance(self.process, CompletedBake):
+            return float(result.report["seconds"])
         return time.monotonic() - self.started
 
     def store(self) -> BakeResult:
@@ -248,7 +249,7 @@ class BakeSession:
         self.note_changes()
         self.discard()
         self.close()
-        return baked_message(result, self.seconds)
+        return baked_message(result, self.seconds(result))
 
     def discard(self) -> None:
         """Drop the job folder."""

@@ -31,6 +31,7 @@ from .properties import assign, session
 from .relit import draw_lit, read_all, relit
 
 DRAWN_SAMPLES = 4  # of the preview, per pixel and axis: edges within objects as smooth as those of the render
+MANY_PIXELS = 10 ** 6  # from which on edges are fine enough, and such a picture takes too much memory
 BEHIND = (0.05, 0.05, 0.05)  # what both pictures stand on, scene-linear: the sky does not count
 MOST_SAMPLES = 2 ** 16
 IMAGE = "PRT Comparison"
@@ -103,11 +104,11 @@ class CompareSession:
         parts, samples = parts_of(samples)
         baked = read_all(scene, scene.name)
         lit = relit(scene, baked, window=_window(scene))
-        draw_lit(scene, baked, lit, 8, 8)  # shaders are compiled and data is loaded once, not for every picture
+        draw_lit(scene, baked, lit, 8, 8)  # compiles the shaders, which is no part of a picture's time
         started = time.perf_counter()
         draw_lit(scene, baked, lit, *size)
         seconds = time.perf_counter() - started
-        drawn = draw_lit(scene, baked, lit, *size, samples=DRAWN_SAMPLES)
+        drawn = draw_lit(scene, baked, lit, *size, samples=DRAWN_SAMPLES if size[0] * size[1] <= MANY_PIXELS else 2)
         names = list(baked)
         remarks = [*_remarks(scene, {name: b.header for name, b in baked.items()}), *lit.warnings]
         process = start_render(scene, bpy.context.view_layer, names, size, parts, samples)
@@ -123,7 +124,7 @@ class CompareSession:
             save_json(self.report, compared.result)
         where = [] if shown else [f"The picture is the image \"{IMAGE}\": open an Image Editor to see it"]
         assign(session(), comparison="\n".join([*compared.lines, *where]))
-        return compared.lines[0]
+        return f"Compared with Cycles: {compared.lines[0][0].lower()}{compared.lines[0][1:]}"
 
     def object_in_use(self) -> None:
         """Nothing that could be in edit mode is written."""

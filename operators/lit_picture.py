@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
+from ..prt_addon.blender.image_albedo import surface_textures
 from ..prt_addon.blender.lights import environment_picture
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale
 from ..prt_addon.errors import PRTError
@@ -39,7 +40,8 @@ def lit_picture(context: bpy.types.Context) -> NDArray[np.uint8] | None:
 
     lit = relit(scene, baked, window=scene.prt.window)
     items = [DrawItem(name, b, lit.moved[name], lit.light[name], 2.0 ** scene.prt.exposure, name in old,
-                      direct=lit.direct[name]) for name, b in baked.items()]
+                      direct=lit.direct[name], textures=surface_textures(scene.objects[name], b, depsgraph))
+             for name, b in baked.items()]
     sky = None if scene.render.film_transparent else environment_picture(scene, depsgraph)
     return draw_thumbnail(scene, items, sky, *_viewport(context))
 

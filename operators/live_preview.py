@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from ..gpu_shaders import viewport
 from ..gpu_shaders.occluders import Occluder
+from ..gpu_shaders.overlay import Marks
 from ..gpu_shaders.render_data import DrawItem, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
+from ..prt_addon.blender.image_albedo import surface_textures, textures_key
 from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.read_scene import read_object_triangles, read_triangles
 from ..prt_addon.blender.stored import (
@@ -41,8 +43,10 @@ from ..prt_addon.lighting.local_lights import LocalLight
 from ..prt_addon.relighting.moved_light import distant_light_in, is_turned
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.reporting.summary import summary
+from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
+from .display import Display
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
 
@@ -54,6 +58,7 @@ OUTSIDE_LABEL = "outside the light cloud: no bounced light"
 OUTLINES = ("BOUNDS", "WIRE")
 SURFACE_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 SURFACE_DATA = (bpy.types.Material, bpy.types.Mesh)
+UNLISTED = ("LIGHT", "CAMERA")  # objects that hold no bake
 LISTED_TYPES = (bpy.types.Object, bpy.types.Scene, bpy.types.Collection)
 LIGHT_TYPES = (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.NodeTree, bpy.types.Scene,
                bpy.types.Collection)
@@ -74,6 +79,8 @@ class Shown:
     stale: bool = False
     direct: NDArray[np.float32] | None = None
     moved: NDArray[np.float64] | None = None
+    textures: SurfaceTextures | None = None
+    textures_key: Hashable = None
 
 
 @dataclass
@@ -90,6 +97,7 @@ class Line:
     overdraw: float = 0.0
     overdraw_before: float = 0.0
     error_spent: float = 0.0
+    receiver_errors: bool = False
     stale: str = ""
 
 
@@ -116,7 +124,9 @@ class Live:
     light_seconds: float = 0.0
     stale_seconds: float = 0.0
     stale_due: float = 0.0
+    display: Display = field(default_factory=Display)
     bakes_dirty: bool = True
+    list_dirty: bool = True  # objects may have come or gone
     light_dirty: bool = True
     stale_dirty: bool = True
     working: ClassVar[bool] = False
@@ -162,7 +172,7 @@ def enable() -> None:
     """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
     _read_bakes()
     _read_light()
-    viewport.enable(draw_list, shows_everything, labels, occluders)
+    viewport.enable(draw_list, shows_everything, labels, occluders, marks)
     assign(session(), preview=True)
     _tell_panel()
 
@@ -187,16 +197,19 @@ def draw_list() -> list[DrawItem]:
     if _live.signature is None:
         return []
     space, exposure = bpy.context.space_data, 2.0 ** bpy.context.scene.prt.exposure
+    colours = _live.display.colours_of(bpy.context.scene.prt.display, _bakes())
     items, owners = [], {name: found for found in bpy.context.view_layer.objects
                          if (name := found.name_full) in _live.owners}
-    for shown in _live.shown.values():
+    for name, shown in _live.shown.items():
         found = owners.get(shown.owner)
         if found is None or not _is_drawn(found, space):
             continue
         moved = transform_since_bake(found, shown.baked.header, _placed(found, shown.local))
         basis = shown.baked.lighting_basis
         light = joined_light(basis, _light_in(basis, moved), _live.lamps.cloud_light(shown.baked, shown.moved))
-        items.append(DrawItem(shown.key, shown.baked, moved, light, exposure, shown.stale, direct=shown.direct))
+        painted = colours.get(name)
+        items.append(DrawItem(shown.key, shown.baked, moved, light, 1.0 if painted else exposure, shown.stale,
+                              direct=shown.direct, colours=painted, textures=shown.textures))
     if len(owners) < len(_live.owners):  # one was renamed or removed, which Blender may not tell
         _live.bakes_dirty = True
         _schedule(SHORTEST_WAIT)
@@ -250,6 +263,16 @@ def labels() -> list[tuple[str, tuple[float, ...]]]:
     """What is written beside lamps: those outside of the cloud."""
     outside = _live.lamps.outside if _live.shown else set()
     return [(OUTSIDE_LABEL, tuple(lamp.position)) for lamp in _live.lamps_read if lamp.name in outside]
+
+
+def marks() -> Marks:
+    """What is marked in the scene: lights of the cloud or patches of lit surfaces; and the legend of false colours."""
+    moves = {name: shown.moved for name, shown in _live.shown.items()}
+    return _live.display.marks(_bakes(), moves, bpy.context.scene.prt.show_cloud)
+
+
+def _bakes() -> dict[str, BakedTransfer]:
+    return {name: shown.baked for name, shown in _live.shown.items()}
 
 
 def _light_in(basis: Columns, moved: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -311,6 +334,7 @@ def _read_bakes() -> None:
         line.overdraw = float(coherence.get("both", 0.0))
         line.overdraw_before = float(coherence.get("before", 0.0))
         spent = coherence.get("squared_error_after", 0.0) - coherence.get("squared_error_before", 0.0)
+        line.receiver_errors = baked.error is not None
         line.error_spent = spent / coherence["squared_error_before"] if coherence and spent > 0.0 else 0.0
         if owner.name_full in layer:
             key = _context_key(), name, transfer_signature(baked)
@@ -399,6 +423,9 @@ def _read_stale() -> None:
         except PRTError as error:
             line.stale = str(error)
         shown.stale = bool(line.stale)
+        key = textures_key(found, depsgraph)
+        if key != shown.textures_key:
+            shown.textures_key, shown.textures = key, surface_textures(found, shown.baked, depsgraph)
         shown.moved = None if shown.stale else transform_since_bake(found, shown.baked.header, matrix)
         changed |= before[0] != shown.stale or not np.array_equal(before[1], shown.moved)
     if changed and any(shown.baked.cloud is not None for shown in _live.shown.values()):
@@ -512,9 +539,10 @@ def _follow() -> float | None:
     """Do for the scene of this context what is to be done; the seconds until there is more."""
     now = time.perf_counter()
     try:
-        if _live.bakes_dirty or _live.known != _known(_bakes_here()):
+        if _live.bakes_dirty or (_live.list_dirty and _live.known != _known(_bakes_here())):
             _live.light_dirty = True
             _read_bakes()
+        _live.list_dirty = False
         if _live.stale_dirty and now >= _live.stale_due:
             _read_stale()
         if _live.light_dirty and session().preview:
@@ -542,11 +570,11 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 
 def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     """Note what a depsgraph's updates may have changed. light: whether that has changed for certain."""
-    geometry, asked, reshaped = False, light, False
+    geometry = asked = reshaped = False
     for update in depsgraph.updates:
         changed = update.id
         reshaped |= update.is_updated_geometry
-        asked |= isinstance(changed, LISTED_TYPES)
+        asked |= isinstance(changed, LISTED_TYPES) and getattr(changed, "type", "") not in UNLISTED
         if isinstance(changed, LIGHT_TYPES):
             light = True
         elif isinstance(changed, bpy.types.Object):
@@ -557,6 +585,7 @@ def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     now = time.perf_counter()
     for live in _lives.values():
         live.light_dirty |= light
+        live.list_dirty |= asked
         live.geometry += reshaped
         if geometry and not live.stale_dirty:
             live.stale_dirty, live.stale_due = True, now + max(STALE_WAIT, 4.0 * live.stale_seconds)

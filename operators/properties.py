@@ -34,6 +34,15 @@ LAMP_BASIS_ITEMS = (
     ("cloud", "Light Cloud", "Lights of a cloud, between which a lamp is interpolated: a little faster to relight, "
                              "less exact near to surfaces, and without bounced light outside of the cloud", 1),
 )
+DISPLAY_ITEMS = (
+    ("relit", "Light", "The objects as World, Suns and lamps light them", 0),
+    ("clusters", "Clusters", "A colour for each cluster of receivers that share their basis vectors. Costs nothing; "
+                             "the view transform does not touch these colours", 1),
+    ("error", "Error", "How far compression is off at each receiver, relative to the object's mean transfer. Costs "
+                       "nothing, but needs a bake that kept its errors", 2),
+    ("vectors", "Vectors", "How many basis vectors each cluster has. Costs nothing; they differ with the adaptive "
+                           "encoder, or where less is enough", 3),
+)
 LIGHTINGS = {"environment": "environment", "local": "local", "both": "environment,local"}
 GLOSSY_ROWS_ITEMS = (
     ("0", "None", "Only diffuse light: metal is black. The fastest, and the least data", 0),
@@ -48,6 +57,14 @@ ENCODER_ITEMS = (
     ("iterative", "Iterative", "Clusters follow as vectors are added. Costs some seconds more than static", 1),
     ("adaptive", "Adaptive", "Clusters that need more vectors get them. The least error for the same data, at up to "
                              "twice the time", 2),
+    ("eigentransport", "Eigentransport", "One basis for all receivers, with more vectors. Relights fast; needs about a "
+                                         "hundred vectors, and blurs or rings in hard shadows", 3),
+)
+DISTANT_BASIS_ITEMS = (
+    ("sh", "Spherical Harmonics", "Smooth functions: small, fast, with highlights and translucency. A sun's shadows "
+                                  "are as soft as the order says", 0),
+    ("cubemap", "Cubemap", "The texels of a cubemap: shadows of suns as sharp as a texel. Costs several times the time "
+                           "and memory; diffuse light only, metal is black", 1),
 )
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
@@ -59,6 +76,7 @@ QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing"
            "surface_columns", "cloud_lights", "merge_response")
 # What goes into a bake under its own name.
 OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "lamp_basis", "cloud_spacing", "cloud_emission",
+             "distant_basis", "cubemap_size", "memory_budget",
              "zone_receivers", "fit_order_to_light", "threads", "seed")
 ROUNDING = 1e-6  # of single precision
 
@@ -109,6 +127,20 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Bands of the lighting. Higher buys sharper shadows; memory and relighting cost grow with the "
                     "square",
     )
+    distant_basis: EnumProperty(
+        name="Sky By", items=DISTANT_BASIS_ITEMS, default=PRESETS["standard"].distant_basis,
+        description="What World and Suns are baked in",
+    )
+    cubemap_size: IntProperty(
+        name="Texels", min=2, max=32, default=PRESETS["standard"].cubemap_size,
+        description="Along each edge of the cubemap. Twice as many show shadows twice as sharp; time, memory and disk "
+                    "grow with the square",
+    )
+    memory_budget: FloatProperty(
+        name="Memory", min=0.0, soft_max=64.0, precision=1, default=PRESETS["standard"].memory_budget,
+        description="Gigabytes of transfer kept in memory while a cubemap is baked; more goes to a file, which costs "
+                    "time. 0 is no limit",
+    )
     bounces: BoolProperty(
         name="Bounced Light", default=True,
         description="Light from surface to surface: colours bleed, corners brighten. Costs about as long again as "
@@ -119,6 +151,15 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Brightens the preview alone, in stops. Costs nothing and changes no baked data",
     )
 
+    display: EnumProperty(
+        name="Show", items=DISPLAY_ITEMS, default="relit", update=_redraw,
+        description="What the preview shows of baked objects: their light, or how they are compressed",
+    )
+    show_cloud: BoolProperty(
+        name="Show Light Cloud", update=_redraw, default=False,
+        description="Marks the lights of the light cloud (grey; merged ones in their zone's colour), or the patches of "
+                    "the surfaces that lamps shine on. Costs some drawing while on, nothing while off",
+    )
     window: BoolProperty(
         name="Soften Ringing", update=_light_changed, default=False,
         description="Takes dark ripples around very bright, small lights away. Costs some of the light's detail, and "
@@ -172,8 +213,9 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "of light costs a little more",
     )
     vectors: IntProperty(
-        name="Most Vectors", min=0, max=24, default=PRESETS["standard"].vectors,
-        description="Basis vectors of each cluster. More buys less error; every receiver stores one number for each",
+        name="Most Vectors", min=0, max=192, soft_max=24, default=PRESETS["standard"].vectors,
+        description="Basis vectors of each cluster. More buys less error; every receiver stores one number for each. "
+                    "Up to 24, with Eigentransport up to 192",
     )
     compression_error: FloatProperty(
         name="Error Goal", min=0.0, max=1.0, precision=4, step=0.1, default=PRESETS["standard"].compression_error,
@@ -322,6 +364,7 @@ class PRTBakedObject(bpy.types.PropertyGroup):
     overdraw: FloatProperty()
     overdraw_before: FloatProperty()
     error_spent: FloatProperty()
+    receiver_errors: BoolProperty()
     stale: StringProperty()
 
 

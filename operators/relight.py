@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ..prt_addon.blender.stored import baked_mesh
+from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError, StorageError
 from ..prt_addon.storage.files import save_arrays
 from .arguments import path_of
@@ -65,8 +66,9 @@ class PRT_OT_relight(bpy.types.Operator):
                         self.use_scene_lights, window)
             if self.filepath:
                 save_arrays(path_of(self.filepath), radiance_arrays(baked, lit))
+            objects = dict(zip(baked, find_objects(list(baked), scene), strict=True))
             for name, transfer in ({} if self.filepath else baked).items():
-                write_colours(baked_mesh(scene.objects[name]), lit.radiance(name, transfer))
+                write_colours(baked_mesh(objects[name]), lit.radiance(name, transfer))
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -75,7 +77,7 @@ class PRT_OT_relight(bpy.types.Operator):
         if self.filepath:
             self.report({"INFO"}, f"Wrote {path_of(self.filepath)}")
             return {"FINISHED"}
-        carriers = [name for name in baked if baked_mesh(scene.objects[name]) != scene.objects[name].data]
+        carriers = [name for name in baked if baked_mesh(objects[name]) != objects[name].data]
         text = f"Lit {len(baked)} object{'' if len(baked) == 1 else 's'}"
         if carriers:
             text += f"; of {', '.join(carriers)} the attribute is on the hidden receiver mesh"

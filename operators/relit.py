@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.blender.fingerprint import surroundings
+from ..prt_addon.blender.image_albedo import surface_textures
 from ..prt_addon.blender.lights import distant_light
 from ..prt_addon.blender.stored import baked_objects, read_baked, stale, transform_since_bake
+from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import BadScene
 from ..prt_addon.relighting.exit_radiance import view_radiance
 from ..prt_addon.relighting.moved_light import distant_light_in, moved_normals, moved_points
@@ -37,7 +39,8 @@ class Lit:
 
 
 def read_all(scene: bpy.types.Scene, subject: str) -> dict[str, BakedTransfer]:
-    """The baked data of all objects by name. Raises where there is none, or where it is stale: never silently used."""
+    """The baked data of all objects by full name. Raises where there is none, or where it is stale: never silently
+    used."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
     found: dict[str, BakedTransfer] = {}
@@ -48,7 +51,7 @@ def read_all(scene: bpy.types.Scene, subject: str) -> dict[str, BakedTransfer]:
         why = stale(baked_object, depsgraph, around)
         if why:
             raise BadScene(baked_object.name, f"its bake is stale: {why}", "Bake it again")
-        found[baked_object.name] = transfer
+        found[baked_object.name_full] = transfer
     if not found:
         raise BadScene(subject, "no object in it is baked", "Bake it first with `prt bake`")
     return found
@@ -64,7 +67,8 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
     depsgraph = bpy.context.evaluated_depsgraph_get()
     distant, warnings, _ = distant_light(scene, depsgraph, (b.lighting_basis for b in baked.values()), environment,
                                          rotate, use_scene_lights, window, all(b.cloud is None for b in baked.values()))
-    moved = {name: transform_since_bake(scene.objects[name], b.header) for name, b in baked.items()}
+    objects = find_objects(list(baked), scene)
+    moved = {name: transform_since_bake(found, baked[name].header) for name, found in zip(baked, objects, strict=True)}
     scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
     light, direct = {}, {}
@@ -94,5 +98,7 @@ def draw_lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], lit: Lit, 
     from ..gpu_shaders import offscreen  # a machine without a graphics driver can do all else
     from ..gpu_shaders.render_data import DrawItem
 
-    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name]) for name, b in baked.items()]
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    items = [DrawItem(name, b, lit.moved[name], lit.light[name], direct=lit.direct[name],
+                      textures=surface_textures(scene.objects[name], b, depsgraph)) for name, b in baked.items()]
     return offscreen.draw_items(scene, items, width, height, background, samples)

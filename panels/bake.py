@@ -37,7 +37,8 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
             wrapped(column, context, line, "ERROR")
         distant = column.column()
         distant.active = settings.lighting != "local"  # columns of lamps know no order
-        distant.prop(settings, "order")
+        distant.prop(settings, "distant_basis")
+        distant.prop(settings, "cubemap_size" if settings.distant_basis == "cubemap" else "order")
         column.prop(settings, "bounces")
         row = layout.row(align=True)
         row.operator("prt.bake", text="Bake Next" if session.running else "Bake", icon="RENDER_STILL")

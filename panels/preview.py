@@ -22,10 +22,25 @@ class PRT_PT_preview(Sidebar, bpy.types.Panel):
                         depress=session.preview)
         column = layout.column()
         column.active = session.preview
+        column.prop(context.scene.prt, "display")
+        _explain(column, context)
         column.prop(context.scene.prt, "exposure")
         column.prop(context.scene.prt, "window")
+        row = column.row()
+        row.active = bool(session.cloud)
+        row.prop(context.scene.prt, "show_cloud")
         for line in session.preview_message.splitlines():
             wrapped(layout, context, line, "ERROR" if "outside the light cloud" in line else "INFO")
         for line in session.viewport_message.splitlines():
             wrapped(layout, context, line, "INFO")
         layout.operator("prt.relight", icon="GROUP_VCOL")
+
+
+def _explain(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Say what is missing for what is to be shown."""
+    if context.scene.prt.display == "error":
+        without = [line.name for line in context.window_manager.prt.objects if line.points and not line.receiver_errors]
+        if without:
+            more = f" and {len(without) - 1} more" if len(without) > 1 else ""
+            wrapped(layout, context, f"{without[0]}{more}: baked before errors were kept, bake again to see them",
+                    "INFO")

@@ -37,7 +37,8 @@ class PRT_PT_object(_Properties, bpy.types.Panel):
             draw_object(layout.column(align=True), context, line)
         if context.object.hide_render:
             wrapped(layout, context, "Hidden in renders: not baked, and without shadow or bounced light", "ERROR")
-        layout.operator("prt.bake", text="Bake Again" if line else "Bake", icon="RENDER_STILL")
+        bake = layout.operator("prt.bake", text="Bake Again" if line else "Bake", icon="RENDER_STILL")
+        bake.objects = context.object.name
 
 
 class PRT_PT_world(_Properties, bpy.types.Panel):

@@ -39,7 +39,10 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
-        distant.prop(settings, "fit_order_to_light")
+        if settings.distant_basis == "cubemap":
+            distant.prop(settings, "memory_budget")
+        else:
+            distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")
 
@@ -52,6 +55,7 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
+        column.active = settings.distant_basis == "sh" or settings.lighting == "local"  # a cubemap holds none
         column.prop(settings, "glossy_rows")
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"

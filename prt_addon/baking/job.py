@@ -31,9 +31,9 @@ from .settings import BakeSettings
 # Raised whenever the same input would give other numbers, so that old stages are not mixed with new code.
 JOB_SCHEMA = 4
 SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
-_SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents")
+_SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents", "source")
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
-_CONTAINER_EXTRA = ("tangents",)  # None where the transfer needs none
+_CONTAINER_EXTRA = ("tangents", "source", "error")  # None where there are none
 _LAMP_ARRAYS = ("material", "kernels")  # of lamp_surfaces
 
 

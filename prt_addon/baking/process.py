@@ -162,7 +162,8 @@ class BakeProcess:
         if self._cancelled:
             return error_message(Cancelled(self.subject, "cancelled", self.cancel_remedy))
         if code == CANT_WRITE:
-            return error_message(PRTError(str(self.job), "the disk is full, or the job folder can't be written",
+            cause = f"the disk is full, or the job folder {self.job} can't be written"
+            return error_message(PRTError(self.subject, cause,
                                           "The previous bake is untouched; free some space and bake again to resume"))
         last = _last_line(self.job / ERROR_FILE)
         if code is not None and code < 0:

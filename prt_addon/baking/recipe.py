@@ -24,6 +24,7 @@ from ..compression.coherence import Coherence, make_coherent
 from ..compression.eigentransport import eigentransport
 from ..compression.encoding import Encoding, encode
 from ..compression.groups import encode_groups
+from ..compression.point_errors import point_errors
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
@@ -141,6 +142,7 @@ class _Bake:
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
+    point_errors: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
     buried: NDArray[np.int64] | None = None
     local: LocalTransfer | None = None
@@ -567,9 +569,10 @@ class _Bake:
         keys = choose_receivers(self.open_keys[self.glossy[self.open_keys]], self.settings.error_receivers,
                                 self.settings.seed)
         if len(keys):
+            functions, columns = glossy.rows.shape[1:3]  # columns of lamps may follow those of distant light
             before = np.concatenate([signals[t.name][keys[(keys >= t.points.start) & (keys < t.points.stop)]
-                                                     - t.points.start, 1:] for t in self.targets
-                                     if signals[t.name].shape[1] == 1 + glossy.rows.shape[1]])
+                                                     - t.points.start, 1:, :columns] for t in self.targets
+                                     if signals[t.name].shape[1] == 1 + functions])
             self.highlights = keys, glossy.at(keys), before
 
     def _choose_local_highlights(self, local: LocalTransfer | None, signals: dict[str, NDArray[np.float32]]) -> None:
@@ -630,6 +633,7 @@ class _Bake:
             encoding, self.coherence[target.name] = make_coherent(
                 encoding, triangles, signal, self.settings.coherence, metric, self.shapes[target.name][0],
                 tick=lambda: state.report(state.fraction))
+        self.point_errors[target.name] = point_errors(signal, encoding, metric)
         return without_scale(encoding, self.basis, self.shapes[target.name])
 
     def _encoder_settings(self, receivers: int, shape: tuple[int, int, int]) -> EncoderSettings:
@@ -760,7 +764,8 @@ class _Bake:
             target.name: object_container(self.scene, target, encodings[target.name], self.shapes[target.name],
                                           self.surfaces.functions_of_object(self.scene, target), self.settings, report,
                                           self.digests.get(target.name, ""), self.basis,
-                                          self._local_columns(target.name))
+                                          self._local_columns(target.name),
+                                          self.point_errors.get(target.name))
             for target in self.targets
         }
         if self.local is not None:

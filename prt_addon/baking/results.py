@@ -49,14 +49,19 @@ LOST_LIMIT = 0.25
 
 def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, shape: tuple[int, int, int],
                      functions: Indices, settings: BakeSettings, report: dict[str, Any], geometry_digest: str,
-                     basis: DistantBasis, local: LocalColumns | None = None) -> BakedTransfer:
+                     basis: DistantBasis, local: LocalColumns | None = None,
+                     error: NDArray[np.float32] | None = None) -> BakedTransfer:
     """The container of one target. shape: (rows, columns, channels); functions: of rows 1, 2, ...; basis: of distant
-    light; local: what is to be known of columns of local lights. Loose points join cluster 0 with no weights."""
+    light; local: what is to be known of columns of local lights; error: (p,) of the points that are not loose. Loose
+    points join cluster 0 with no weights."""
     bases = encoding.bases.reshape(*encoding.bases.shape[:2], *shape)
     count, solid = target.points.stop - target.points.start, ~scene.loose[target.points]
     cluster = np.zeros(count, np.int32)
     weights = np.zeros((count, encoding.weights.shape[1]), np.float32)
     cluster[solid], weights[solid] = encoding.cluster, encoding.weights
+    point_error = None if error is None else np.zeros(count, np.float32)
+    if point_error is not None:
+        point_error[solid] = error
     if local is None:
         columns = columns_entry(basis.entry())
     else:
@@ -88,7 +93,8 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
                          np.ascontiguousarray(scene.albedo[points], np.float32),
                          scene.points[points].astype(np.float32), scene.normals[points].astype(np.float32), triangles,
                          scene.tangents[points].astype(np.float32) if len(functions) else None,
-                         None if local is None else local.cloud)
+                         None if local is None else local.cloud,
+                         source=None if scene.source is None else scene.source[target.triangles], error=point_error)
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def _clipped(colour: tuple[float, ...]) -> tuple[float, float, float]:
 
 def material_digest(materials: list[bpy.types.Material | None]) -> str:
     """Text that changes when a material of the list, or a value or link in one, changes. Pixels of images do not."""
-    trees = [None if m is None else (signature(m.node_tree) if m.node_tree else tuple(m.diffuse_color))
+    trees = [None if m is None else (signature(m.node_tree, edits=False) if m.node_tree else tuple(m.diffuse_color))
              for m in materials]
     return hashlib.blake2b(repr(trees).encode(), digest_size=16).hexdigest()
 

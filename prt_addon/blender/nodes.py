@@ -105,24 +105,25 @@ def copy_groups(tree: bpy.types.NodeTree, change: Callable[[bpy.types.NodeTree],
             copy_groups(node.node_tree, change, copies)
 
 
-def signature(tree: bpy.types.NodeTree) -> Hashable:
-    """Hashable value that changes when nodes, values, links, images (by file) or groups of the tree change."""
-    return tuple((tuple(_node_signature(node) for node in part.nodes),
+def signature(tree: bpy.types.NodeTree, edits: bool = True) -> Hashable:
+    """Hashable value that changes when nodes, values, links, images (by file) or groups of the tree change; with edits
+    also when an image is painted on for the first time since it was saved."""
+    return tuple((tuple(_node_signature(node, edits) for node in part.nodes),
                   tuple((link.from_node.name, link.from_socket.identifier, link.to_node.name,
                          link.to_socket.identifier, link.is_muted) for link in part.links)) for part in walk(tree))
 
 
-def _node_signature(node: bpy.types.Node) -> Hashable:
+def _node_signature(node: bpy.types.Node, edits: bool) -> Hashable:
     inputs = tuple(_value(s.default_value) for s in node.inputs if hasattr(s, "default_value"))
     outputs = tuple(_value(s.default_value) for s in node.outputs if hasattr(s, "default_value"))
-    return node.bl_idname, node.name, inputs, outputs, _struct_signature(node, 0)
+    return node.bl_idname, node.name, inputs, outputs, _struct_signature(node, 0, edits)
 
 
-def _struct_signature(struct: bpy.types.bpy_struct, depth: int) -> Hashable:
+def _struct_signature(struct: bpy.types.bpy_struct, depth: int, edits: bool) -> Hashable:
     """Values of a struct's properties; of data-blocks only their identity, of nested settings their values."""
     if isinstance(struct, bpy.types.Image):
         return (struct.name_full, struct.filepath, tuple(struct.size), struct.colorspace_settings.name, struct.source,
-                struct.alpha_mode, struct.is_dirty)
+                struct.alpha_mode, edits and struct.is_dirty)
     if isinstance(struct, bpy.types.ID):
         return struct.name_full
     parts = []
@@ -133,9 +134,9 @@ def _struct_signature(struct: bpy.types.bpy_struct, depth: int) -> Hashable:
         if item.type in PLAIN:
             parts.append((item.identifier, _value(value)))
         elif item.type == "POINTER" and value is not None and depth < 3:
-            parts.append((item.identifier, _struct_signature(value, depth + 1)))
+            parts.append((item.identifier, _struct_signature(value, depth + 1, edits)))
         elif item.type == "COLLECTION" and depth < 3:
-            parts.append((item.identifier, tuple(_struct_signature(v, depth + 1) for v in value)))
+            parts.append((item.identifier, tuple(_struct_signature(v, depth + 1, edits) for v in value)))
     return tuple(parts)
 
 

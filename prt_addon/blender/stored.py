@@ -4,13 +4,15 @@
 The data sits on the object's own mesh where its vertices are the receivers, else on a receiver mesh `PRT <object>`: a
 hidden child of the object. The object points to that mesh, so that appending or linking the object brings the data
 along and renaming anything breaks nothing. Beyond the contract: `prt_albedo` (FLOAT_COLOR), `prt_normal` and, where
-transfer depends on the view, `prt_tangent` (FLOAT_VECTOR, in the object's space), and where lamps light it, too,
-`prt_material` (INT, places in the property `prt_kernels`), all POINT.
+transfer depends on the view, `prt_tangent` (FLOAT_VECTOR, in the object's space), where lamps light it, too,
+`prt_material` (INT, places in the property `prt_kernels`), and `prt_error` (FLOAT), all POINT; on a receiver mesh
+`prt_source` (INT, FACE): which triangle of the evaluated mesh each one is a part of.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -33,7 +35,7 @@ RECEIVER_NAME = "PRT {}"
 MOVED = "it was moved, turned or scaled since the bake, and not all that is around it came along"
 MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
 OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE,
-        TANGENT_ATTRIBUTE, container.MATERIAL_ATTRIBUTE)
+        TANGENT_ATTRIBUTE, container.MATERIAL_ATTRIBUTE, container.ERROR_ATTRIBUTE, container.SOURCE_ATTRIBUTE)
 
 
 def write_baked(scene_object: bpy.types.Object, baked: BakedTransfer, digests: dict[str, str | None] | None = None,
@@ -105,8 +107,13 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
     if LAMP_SURFACES in header:
         material = _read_attribute(mesh, container.MATERIAL_ATTRIBUTE, 1, scene_object.name)
         kernels = _read_numbers(mesh, container.KERNELS_PROPERTY) if container.KERNELS_PROPERTY in mesh else None
-    return container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud, material,
-                            kernels)
+    baked = container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud, material,
+                             kernels)
+    error = _read_optional(mesh, container.ERROR_ATTRIBUTE, "FLOAT", "POINT")
+    source = _read_optional(mesh, container.SOURCE_ATTRIBUTE, "INT", "FACE")
+    if source is None and header.get("source", {}).get("on_source_mesh"):
+        source = np.arange(len(triangles), dtype=np.int32)
+    return replace(baked, error=error, source=source if source is None or len(source) == len(triangles) else None)
 
 
 def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
@@ -191,9 +198,9 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
         return None
     try:
         changed = changed_piece(then, surroundings, moved)
-        if stays and changed == scene_object.name_full:  # of itself more has been asked above
-            changed = changed_piece(*({name: entry for name, entry in entries.items() if name != changed}
-                                      for entries in (then, surroundings)), moved)
+        if stays and changed == scene_object.name_full and changed not in surroundings:  # hidden in renders itself
+            changed = changed_piece({name: entry for name, entry in then.items() if name != changed}, surroundings,
+                                    moved)
     except ValueError as error:
         raise StorageError(scene_object.name, f"the header of its baked data states no valid digests ({error})",
                            container.REBAKE) from error
@@ -296,17 +303,21 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
     if baked.lamp_surfaces is not None:
         _write_attribute(mesh, container.MATERIAL_ATTRIBUTE, "INT", baked.material)
         mesh[container.KERNELS_PROPERTY] = np.ascontiguousarray(baked.kernels, np.float32).ravel()
+    if baked.error is not None:
+        _write_attribute(mesh, container.ERROR_ATTRIBUTE, "FLOAT", baked.error)
+    if baked.source is not None and not header["source"]["on_source_mesh"]:
+        _write_attribute(mesh, container.SOURCE_ATTRIBUTE, "INT", baked.source, "FACE")
     mesh[container.HEADER_PROPERTY] = json.dumps(header)
 
 
-MEMBERS = {"INT": ("value", 1, np.int32), "FLOAT4": ("vector", 4, np.float32),
+MEMBERS = {"INT": ("value", 1, np.int32), "FLOAT": ("value", 1, np.float32), "FLOAT4": ("vector", 4, np.float32),
            "FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT_COLOR": ("color", 4, np.float32)}
 NOTHING = ("", 0, np.float32)  # of an attribute that is not there, or of a kind that never was ours
 
 
-def _write_attribute(mesh: bpy.types.Mesh, name: str, kind: str, values: NDArray) -> None:
+def _write_attribute(mesh: bpy.types.Mesh, name: str, kind: str, values: NDArray, domain: str = "POINT") -> None:
     member, _, dtype = MEMBERS[kind]
-    attribute = mesh.attributes.new(name, kind, "POINT")
+    attribute = mesh.attributes.new(name, kind, domain)
     if attribute.name != name:
         taken = attribute.name
         mesh.attributes.remove(mesh.attributes[taken])
@@ -324,6 +335,17 @@ def _read_attribute(mesh: bpy.types.Mesh, name: str, least_width: int, subject: 
     values = np.empty(len(attribute.data) * width, dtype)
     attribute.data.foreach_get(member, values)
     return values if width == 1 else values.reshape(-1, width)
+
+
+def _read_optional(mesh: bpy.types.Mesh, name: str, kind: str, domain: str) -> NDArray | None:
+    """Values (n,) that serve the display alone: None where an older bake has none, or something converted them."""
+    attribute = mesh.attributes.get(name)
+    if attribute is None or attribute.data_type != kind or attribute.domain != domain:
+        return None
+    member, _, dtype = MEMBERS[kind]
+    values = np.empty(len(attribute.data), dtype)
+    attribute.data.foreach_get(member, values)
+    return values if values.dtype.kind == "i" or np.isfinite(values).all() else None
 
 
 def _read_bases(mesh: bpy.types.Mesh, subject: str) -> NDArray[np.float32]:

@@ -91,10 +91,10 @@ def encode(signal: NDArray[np.floating], settings: EncoderSettings, metric: NDAr
     with Workers(settings.threads, monitor.tick) as monitor.workers:
         frame = global_frame(signal, metric, monitor.workers, unseen)
         monitor.unit = frame.scale**2
-        state, left_out = _classify(frame, settings, monitor)
+        state, left_out = classify(frame, settings, monitor)
         monitor.span(0.95, 1.0)
-        enough = _enough(frame, settings) if settings.target_error is not None else None
-        result = _finish(frame, state, enough, monitor.workers)
+        enough = enough_of(frame, settings) if settings.target_error is not None else None
+        result = finish(frame, state, enough, monitor.workers)
     monitor.note("done", float(result.discarded.sum()) / monitor.unit, 1.0)
     return replace(result, history=tuple(monitor.history), adaptive_left_out=left_out)
 
@@ -110,12 +110,12 @@ def vector_quantization(signal: NDArray[np.floating], clusters: int, seed: int =
     return encode(signal, EncoderSettings(clusters, 0, "static", seed, iterations))
 
 
-def _enough(frame: GlobalFrame, settings: EncoderSettings) -> float:
+def enough_of(frame: GlobalFrame, settings: EncoderSettings) -> float:
     """The squared error, in the frame's units, below which nothing more is spent."""
     return max(settings.target_error or 0.0, ROUNDING) * frame.energy
 
 
-def _classify(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -> tuple[Subspaces, bool]:
+def classify(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -> tuple[Subspaces, bool]:
     """Every point's cluster, every cluster's number of vectors, perhaps subspaces near the best; and whether the
     adaptive pass was left out."""
     if settings.clusters == 1 or frame.tail[0] <= ROUNDING * frame.energy:
@@ -123,7 +123,7 @@ def _classify(frame: GlobalFrame, settings: EncoderSettings, monitor: Monitor) -
     if settings.method == "static":
         return _unfitted(static_labels(frame, settings, monitor), settings), False
     share = 0.6 if settings.method == "adaptive" else 0.95
-    state = _best_start(frame, settings, _enough(frame, settings), monitor, share)
+    state = _best_start(frame, settings, enough_of(frame, settings), monitor, share)
     left_out = False
     if settings.method == "adaptive":
         monitor.span(share, 0.95)
@@ -178,7 +178,7 @@ def _is_wide(frame: GlobalFrame) -> bool:
     return frame.coordinates.shape[1] >= WIDE_VALUES
 
 
-def _finish(frame: GlobalFrame, state: Subspaces, enough: float | None, workers: Workers) -> Encoding:
+def finish(frame: GlobalFrame, state: Subspaces, enough: float | None, workers: Workers) -> Encoding:
     """Exact PCA of every cluster on all values, then back to the signal's own values.
 
     enough: squared error up to which the least useful vectors are left out again; None keeps all.

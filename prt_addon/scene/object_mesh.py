@@ -26,6 +26,7 @@ class ObjectMesh:
     materials: what they do beyond diffuse reflection. material_index: (t,) int32 into materials; None is all 0.
     corner_tangents: (t, 3, 3) float32 directions of any length along the surface, zero where any direction serves
     (isotropic materials); None is zero everywhere.
+    source: (t,) int32, which of the triangles that were read each one is; None while they are all there, in order.
     """
 
     name: str
@@ -39,10 +40,17 @@ class ObjectMesh:
     materials: tuple[SurfaceMaterial, ...] = (DIFFUSE,)
     material_index: NDArray[np.int32] | None = None
     corner_tangents: NDArray[np.float32] | None = None
+    source: NDArray[np.int32] | None = None
+
+    @property
+    def sources(self) -> NDArray[np.int32]:
+        """`source`, spelt out where it is None."""
+        return np.arange(len(self.triangles), dtype=np.int32) if self.source is None else self.source
 
     def with_triangles(self, kept: NDArray[np.bool_]) -> ObjectMesh:
         """The mesh with only some of its triangles, (t,) bool."""
-        return replace(self, triangles=self.triangles[kept], corner_normals=self.corner_normals[kept],
+        return replace(self, triangles=self.triangles[kept], source=self.sources[kept],
+                       corner_normals=self.corner_normals[kept],
                        corner_albedo=self.corner_albedo[kept],
                        material_index=None if self.material_index is None else self.material_index[kept],
                        corner_tangents=None if self.corner_tangents is None else self.corner_tangents[kept])

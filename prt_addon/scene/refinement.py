@@ -44,14 +44,16 @@ class EdgeLimit:
 
 @dataclass
 class Beside:
-    """What points carry besides position, normal and albedo.
+    """What points carry besides position, normal and albedo, and triangles besides corners.
 
     material: (p,) int32; an edge whose ends differ (they can't on a split surface) gives its middle the lower number.
     tangents: (p, 3) float64, unit and orthogonal to the normal, or None to leave them out.
+    source: (t,) int32, a number of each triangle's that its parts inherit, or None to leave it out.
     """
 
     material: NDArray[np.int32]
     tangents: NDArray[np.float64] | None
+    source: NDArray[np.int32] | None = None
 
     def grow(self, ends: NDArray[np.int64], normals: NDArray[np.float64]) -> None:
         """Append the middles of edges (e, 2), whose normals (e, 3) are known."""
@@ -92,15 +94,20 @@ def refine(points: NDArray[np.float64], normals: NDArray[np.float64], albedo: ND
         albedo = np.concatenate([albedo, albedo[ends].mean(axis=1)])
         if beside is not None:
             beside.grow(ends, between)
-        triangles = _cut(points, triangles, middle)
+        triangles, parent = _cut(points, triangles, middle)
+        if beside is not None and beside.source is not None:
+            beside.source = beside.source[parent]
     return points, normals, albedo, triangles
 
 
-def _cut(points: NDArray[np.float64], triangles: NDArray[np.int32], middle: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Triangles cut at the middles (t, 3) of their edges (corner k to k + 1); -1 leaves an edge whole."""
+def _cut(points: NDArray[np.float64], triangles: NDArray[np.int32], middle: NDArray[np.int64],
+         ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Triangles cut at the middles (t, 3) of their edges (corner k to k + 1), -1 leaves an edge whole; and which
+    triangle each one is a part of."""
     split = middle >= 0
     count = split.sum(axis=1)
     parts = [triangles[count == 0]]
+    whole, one, two, three = (np.flatnonzero(count == number) for number in range(4))
     # Three middles: four similar triangles.
     (a, b, c), (ab, bc, ca) = triangles[count == 3].T, middle[count == 3].T
     parts += [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
@@ -113,7 +120,8 @@ def _cut(points: NDArray[np.float64], triangles: NDArray[np.int32], middle: NDAr
     parts += [np.stack((ab, b, bc), axis=1),
               np.stack((a, ab, bc), axis=1)[short], np.stack((a, bc, c), axis=1)[short],
               np.stack((a, ab, c), axis=1)[~short], np.stack((ab, bc, c), axis=1)[~short]]
-    return np.concatenate(parts).astype(np.int32)
+    parents = [whole, *[three] * 4, *[one] * 2, two, *[two[short]] * 2, *[two[~short]] * 2]
+    return np.concatenate(parts).astype(np.int32), np.concatenate(parents)
 
 
 def _turned(triangles: NDArray[np.int32], middle: NDArray[np.int64], start: NDArray[np.int64],

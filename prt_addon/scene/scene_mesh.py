@@ -54,6 +54,7 @@ class SceneMesh:
     loose: (p,) bool, points without a face (they keep their place, so that data fits the mesh, and get no transfer);
     material: (p,) int32 into materials; tangents: (p, 3) float64, unit, orthogonal to the normals; materials: each
     once (names aside), the first always DIFFUSE, which stands for all that only reflect diffusely;
+    source: (t,) int32, which of its object's triangles, as they were read, each one is or is a part of;
     warnings: what was dropped or repaired, one line each.
     """
 
@@ -67,6 +68,7 @@ class SceneMesh:
     objects: tuple[SceneObject, ...]
     materials: tuple[SurfaceMaterial, ...] = (DIFFUSE,)
     warnings: tuple[str, ...] = ()
+    source: NDArray[np.int32] | None = None
 
     @property
     def size(self) -> float:
@@ -109,6 +111,7 @@ class _Part:
     material: NDArray[np.int32]
     tangents: NDArray[np.float64]
     matches_source: bool
+    source: NDArray[np.int32]
 
 
 def _number_materials(objects: list[ObjectMesh]) -> tuple[tuple[SurfaceMaterial, ...], list[NDArray[np.int32]]]:
@@ -189,7 +192,7 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
     normals[~degenerate] /= length[~degenerate, None]
     _replace_normals(points, triangles, normals, degenerate)
     albedo = np.clip(_mean_per_group(mesh.corner_albedo.reshape(-1, 3), group, count), 0.0, 1.0)
-    beside = Beside(np.zeros(count, np.int32), None)
+    beside = Beside(np.zeros(count, np.int32), None, mesh.sources)
     beside.material[group] = np.repeat(material, 3)
     if tangent is not None:
         wanted = _mean_per_group(mesh.corner_tangents.reshape(-1, 3), group, count)
@@ -204,7 +207,8 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
     tangents = beside.tangents
     if tangents is None:  # of diffuse points nobody asks
         tangents = smooth_tangents(normals, quiet_pole(normals) if beside.material.any() else UP)
-    return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material, tangents, matches)
+    return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material, tangents, matches,
+                 beside.source)
 
 
 def _unit_corner_tangents(mesh: ObjectMesh) -> NDArray[np.float64] | None:
@@ -254,8 +258,8 @@ def _join(objects: list[ObjectMesh], parts: list[_Part], materials: tuple[Surfac
     joined = np.concatenate(triangles).astype(np.int32)
     loose = np.ones(first_point, bool)
     loose[joined.ravel()] = False
-    points, normals, albedo, material, tangents = (
+    points, normals, albedo, material, tangents, source = (
         np.concatenate([getattr(p, name) for p in parts])
-        for name in ("points", "normals", "albedo", "material", "tangents"))
+        for name in ("points", "normals", "albedo", "material", "tangents", "source"))
     return SceneMesh(points, normals, joined, albedo, loose, material, tangents, tuple(scene_objects), materials,
-                     warnings)
+                     warnings, source)

@@ -29,6 +29,8 @@ HEADER_PROPERTY = "prt_header"
 BASES_PROPERTY = "prt_bases"
 CLOUD_PROPERTY = "prt_cloud"
 MATERIAL_ATTRIBUTE = "prt_material"
+ERROR_ATTRIBUTE = "prt_error"
+SOURCE_ATTRIBUTE = "prt_source"
 KERNELS_PROPERTY = "prt_kernels"
 REBAKE = "Bake the object again"
 CONSTANT_ROWS: dict[str, Any] = {"kind": "constant"}
@@ -52,6 +54,8 @@ class BakedTransfer:
     cloud: the local lights or lit surfaces that columns belong to, world space when baked; None where all columns are
     distant light's.
     lamp_surfaces: what materials do to the direct light of lamps, where there are a cloud and view-dependent rows.
+    source: (t,) int32, which of the source mesh's triangles each one is or is a part of; None in bakes that did not
+    keep it. error: (p,) float32, how far off M_p is, relative to the RMS of the object's transfer; None likewise.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
     x tangent, y normal x tangent, z normal.
@@ -68,6 +72,8 @@ class BakedTransfer:
     tangents: NDArray[np.float32] | None = None
     cloud: LocalBasis | None = None
     lamp_surfaces: LampSurfaces | None = None
+    source: NDArray[np.int32] | None = None
+    error: NDArray[np.float32] | None = None
 
     @property
     def material(self) -> NDArray[np.int32] | None:

@@ -35,6 +35,8 @@ _HIGHEST_F0 = 0.99
 POLAR, AZIMUTH = 40, 40
 # Steps to find where an angle lies, then halvings: to 5e-5, far below the distance of two nodes.
 _STEPS, _BISECTIONS = 16, 12
+# Heights of views between which the albedo of a single bounce is interpolated where there are many views.
+LEVELS = 128
 
 
 @dataclass(frozen=True)
@@ -320,6 +322,7 @@ class PrincipledLobe:
         self.isotropic = self.alpha_x == self.alpha_y
         self.turn = 0.0 if self.isotropic else 2 * math.pi * material.anisotropic_rotation
         self.compensate = compensate
+        self._levels: tuple[Array, Energy] | None = None
         self.metallic = min(max(material.metallic, 0.0), 1.0)
         layers: list[tuple[float, Metal | Dielectric]] = []
         if self.metallic > 0:
@@ -343,6 +346,32 @@ class PrincipledLobe:
             reflectance += part[..., :self.channels]
         return Scattered(facets.lights, facets.unblocked[..., None] * reflectance,
                          facets.kernel[..., None] * reflectance)
+
+    def kernel(self, views: Array, lights: Array) -> Array:
+        """f(v, s) cos(s) (n, m, c) of views (n, 3) and lights (m, 3) above the horizon, in the lobe's own frame."""
+        half = views[:, None, :] + lights
+        half /= np.sqrt(row_squares(half))[..., None]
+        cosines = np.clip(np.sum(half * views[:, None, :], axis=-1), 0.0, 1.0)
+        alphas = self.alpha_x, self.alpha_y
+        masking = 1 / (1 + _smith_lambda(*alphas, views)[:, None] + _smith_lambda(*alphas, lights))
+        facets = _distribution(*alphas, half) * masking / (4 * views[:, None, 2])
+        energy = self._energy_between_levels(views[:, 2]) if self.compensate else None
+        result = np.zeros((*facets.shape, self.channels))
+        for weight, layer in self.layers:
+            part = weight * layer.reflectance(cosines)
+            if energy is not None:
+                part *= energy.compensation(layer.mean())[:, None, :]
+            result += part[..., :self.channels]
+        return result * facets[..., None]
+
+    def _energy_between_levels(self, z: Array) -> Energy:
+        """`energy_of` many views at heights z (n,), interpolated between LEVELS."""
+        if self._levels is None:
+            levels = np.linspace(0.0, 1.0, LEVELS + 1)
+            levels[0] = 1e-4
+            self._levels = levels, energy_of(self.alpha_x, self.alpha_y, meridian(levels))
+        levels, energy = self._levels
+        return Energy(np.interp(z, levels, energy.albedo), energy.mean)
 
     def dimming(self, views: Array) -> Array:
         """What the dielectric leaves of the diffuse layer (n,) towards views (n, 3): 1 - its albedo there.

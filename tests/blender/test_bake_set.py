@@ -122,6 +122,27 @@ def test_what_was_hidden_at_the_bake_counts_as_unknown(scene: bpy.types.Scene) -
     assert why(cubes[0]) is None
 
 
+def test_another_ones_mesh_with_its_bake_is_stale(scene: bpy.types.Scene) -> None:
+    """All that the carried bake says of its own mesh is true, but what stood here is gone."""
+    _, cubes = three(scene)
+    cubes[1].location = cubes[0].location
+    cubes[1].rotation_euler = cubes[0].rotation_euler
+    cubes[1].scale = (1.0, 1.0, 2.0)
+    graph = depsgraph()
+    stored.write_baked(cubes[0], bake_of(cubes[0]), None, fingerprint.surroundings(graph))
+    cubes[1].scale, cubes[1].data = (1.0, 1.0, 1.0), cubes[0].data.copy()
+    cubes[1][stored.RECEIVER_PROPERTY] = cubes[0][stored.RECEIVER_PROPERTY]
+    assert "Floor" in why(cubes[1]) and "Floor" in why(cubes[0])
+
+
+def test_an_object_hidden_in_renders_keeps_its_own_bake(scene: bpy.types.Scene) -> None:
+    _, cubes = three(scene)
+    cubes[0].hide_render = True
+    assert why(cubes[0]) is None
+    cubes[2].location.z += 0.2
+    assert "Wall" in why(cubes[0])
+
+
 def test_edit_mode_alone_changes_nothing(scene: bpy.types.Scene) -> None:
     """Nor do sculpting and painting before the first stroke; an edit does at once."""
     _, cubes = three(scene)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -48,7 +49,7 @@ def follow() -> live_preview.Live:
     """Everything that the timer would do, with what the handlers would have noted."""
     depsgraph()
     live = live_preview._lives.setdefault(live_preview._context_key(), live_preview.Live())
-    live.light_dirty = live.stale_dirty = True
+    live.light_dirty = live.stale_dirty = live.list_dirty = True
     live.stale_due = 0.0
     live_preview._follow()
     live_preview._tell_panel()
@@ -151,3 +152,26 @@ def test_an_instanced_collection_shows_its_bakes(cubes: list[bpy.types.Object]) 
     held.objects.unlink(cubes[2])
     follow()
     assert listed() == {"Place/Statue": True, "Place/Wall": True}
+
+
+def test_linked_bakes_are_shown_and_lit(cubes: list[bpy.types.Object], tmp_path: Path) -> None:
+    """Read-only, from another file, beside a local object of the same name."""
+    from prt.operators.relit import read_all, relit
+
+    path = tmp_path / "library.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    assert cubes
+    bpy.ops.wm.read_homefile(use_empty=True)
+    scene = bpy.context.scene
+    scene.world = bpy.data.worlds.new("Sky")
+    with bpy.data.libraries.load(str(path), link=True) as (_, into):
+        into.objects = ["Statue", "Wall", "Post"]
+    for found in into.objects:
+        scene.collection.objects.link(found)
+    live_preview._lives.clear()
+    follow()
+    names = {f"{name} [library.blend]" for name in ("Statue", "Wall")}
+    assert listed() == dict.fromkeys(names, False)
+    baked = read_all(scene, "scene")
+    lit = relit(scene, baked)
+    assert set(baked) == names and all(lit.radiance(name, b).max() > 0.0 for name, b in baked.items())

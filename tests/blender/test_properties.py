@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import types
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
 
 # Of the preview alone, or turned into a field of another name.
 NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection",
-             "compare_samples", "compare_percentage"}
+              "compare_samples", "compare_percentage", "display", "show_cloud"}
 
 
 @pytest.fixture
@@ -67,7 +68,9 @@ def test_a_chosen_preset_changes_nothing_of_itself(settings: bpy.types.PropertyG
     ("vectors", 11, "vectors", 11), ("compression_error", 0.25, "compression_error", 0.25),
     ("error_receivers", 7, "error_receivers", 7), ("error_paths", 100, "error_paths", 100),
     ("surface_patches", 77, "surface_patches", 77), ("cloud_emission", 3, "cloud_emission", 3),
-    ("lamp_basis", "cloud", "lamp_basis", "cloud")])
+    ("lamp_basis", "cloud", "lamp_basis", "cloud"), ("distant_basis", "cubemap", "distant_basis", "cubemap"),
+    ("cubemap_size", 8, "cubemap_size", 8), ("memory_budget", 0.5, "memory_budget", 0.5),
+    ("encoder", "eigentransport", "encoder", "eigentransport")])
 @pytest.mark.parametrize("preset", ["draft", "standard", "high"])
 def test_each_control_changes_its_setting_and_no_other(preset: str, name: str, value: object, field: str,
                                                        expected: object, settings: bpy.types.PropertyGroup) -> None:
@@ -154,8 +157,10 @@ def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: b
     context = types.SimpleNamespace(scene=bpy.context.scene, window_manager=bpy.context.window_manager,
                                     selected_objects=[], region=types.SimpleNamespace(width=300),
                                     preferences=types.SimpleNamespace(system=types.SimpleNamespace(ui_scale=1.0)))
-    for panel in (bake.PRT_PT_bake, expert.PRT_PT_rays, expert.PRT_PT_highlights, expert.PRT_PT_local_lights,
-                  expert.PRT_PT_compression, preview.PRT_PT_preview, check.PRT_PT_check):
+    panels = (bake.PRT_PT_bake, expert.PRT_PT_rays, expert.PRT_PT_highlights, expert.PRT_PT_local_lights,
+              expert.PRT_PT_compression, preview.PRT_PT_preview, check.PRT_PT_check)
+    for sky, panel in itertools.product(("cubemap", "sh"), panels):
+        settings.distant_basis = sky
         if "poll" not in vars(panel) or panel.poll(context):
             drawing = types.SimpleNamespace(layout=Drawn(found))
             drawing.column = lambda context, panel=panel, drawing=drawing: panel.column(drawing, context)

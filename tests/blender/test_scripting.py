@@ -37,6 +37,7 @@ told["after"] = [o.name for o in bpy.context.selected_objects]
 for number in range(2):
     bpy.ops.prt.write_report(filepath=str(folder / ("report.json", "report.html")[number]))
 bpy.ops.prt.export(directory=str(folder / "operators"))
+bpy.ops.prt.show_report()
 bpy.ops.prt.relight(rotate=35.0, filepath=str(folder / "turned.npz"))
 bpy.ops.prt.relight(rotate=35.0)
 attribute = bpy.data.objects["Ball"].data.color_attributes.get("PRT Light")

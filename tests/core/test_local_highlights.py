@@ -238,6 +238,21 @@ def test_a_bake_ends_with_both_kinds_of_rows_and_a_joined_one_too():
         assert seen.min() > 0.0  # black, where highlights get nothing from lamps
 
 
+def test_highlights_are_measured_beside_columns_of_lamps():
+    """Their error under distant light is that of a bake without lamps: the same rays, the same rows."""
+    scene = room_with_ball(4)
+    wanted = {"spacing": "0", "threads": "1", "gather_directions": "128", "directions": "256", "surface_columns": "16",
+              "surface_patches": "64", "cloud_lights": "8", "error_receivers": "16", "error_paths": "1024",
+              "compression_error": "0", "vectors": "16", "order": "3", "encoder": "static"}
+    found = {}
+    for lighting in ("environment", "environment,local"):
+        settings = make_settings("standard", wanted | {"lighting": lighting})
+        found[lighting] = exhaust(bake(scene, settings)).report["highlight_errors"]
+    for name in ("sampling", "rows", "basis"):
+        alone, beside = (found[lighting][name]["relative_rms"] for lighting in found)
+        assert beside == pytest.approx(alone, rel=0.02, abs=1e-3), name
+
+
 @pytest.mark.parametrize(("material", "rows", "limit"), [
     (replace(METAL, roughness=0.5), 16, 0.04), (replace(METAL, roughness=0.8), 9, 0.03),
     (replace(METAL, roughness=0.5, anisotropic=0.5, anisotropic_rotation=0.1), 16, 0.06),

@@ -79,12 +79,14 @@ def compare_without_an_editor() -> Step:
     assert session().running and len(children()) == 1
     yield from wait_for_bake("c01_comparing")
     assert not session().failed, session().message
-    assert session().message.startswith("Difference "), session().message
+    assert session().message.startswith("Compared with Cycles: difference "), session().message
     assert "open an Image Editor" in session().comparison, session().comparison
     assert bpy.data.images[IMAGE].size[0] > 3 * 320 and not bpy.data.images[IMAGE].is_dirty
     assert settings_of(scene) == before
     assert [i.name for i in bpy.data.images if i.type == "RENDER_RESULT"] == render_results
     assert not children()
+    box = region("UI")  # the panel is at the end of the sidebar
+    subprocess.run(["xdotool", "mousemove", str(box.x + 60), "500", *["click", "5"] * 40], check=True)
     yield DRAWN
     shoot("c02_compared")
 
@@ -107,6 +109,19 @@ def compare_in_an_editor() -> Step:
     assert [i.name for i in bpy.data.images if i.name.startswith(IMAGE)] == [IMAGE], "a second image was made"
     yield DRAWN
     shoot("c03_in_an_image_editor")
+
+
+def queue() -> Step:
+    """Asked for while a bake runs, it waits, and compares what that bake stored."""
+    scene = bpy.context.scene
+    scene.prt.preset, scene.prt.compare_percentage = "draft", 25.0
+    assert invoke_bake() == {"RUNNING_MODAL"}
+    invoke_compare()
+    assert session().waiting == "Comparison with Cycles", session().waiting
+    yield from wait_for_bake()
+    assert session().message.startswith("Compared with Cycles: difference "), session().message
+    assert "Baked " in session().ended, session().ended
+    assert f"of {160 * 100:,} pixels".replace(",", "\u202f") in session().comparison, session().comparison
 
 
 def cancel() -> Step:
@@ -151,6 +166,7 @@ def report_and_export() -> Step:
         assert bpy.ops.prt.export(directory=str(OUTPUT / "export")) == {"FINISHED"}
         assert bpy.ops.prt.write_report(filepath=str(OUTPUT / "report_ui.html")) == {"FINISHED"}
         assert bpy.ops.prt.write_report(filepath=str(OUTPUT / "report_ui.json")) == {"FINISHED"}
+        assert bpy.ops.prt.show_report() == {"FINISHED"}
     index = json.loads((OUTPUT / "export" / "baked.json").read_text())
     assert {entry["name"] for entry in index["objects"]} == {"Statue", "Floor", "Wall"}
     assert "<html" in (OUTPUT / "report_ui.html").read_text()[:400].lower()
@@ -164,6 +180,6 @@ def report_and_export() -> Step:
     assert (OUTPUT / "again.json").read_bytes() == (OUTPUT / "report_ui.json").read_bytes()
 
 
-STEPS = (open_scene, compare_without_an_editor, compare_in_an_editor, cancel, report_and_export)
+STEPS = (open_scene, compare_without_an_editor, compare_in_an_editor, queue, cancel, report_and_export)
 
 start(STEPS, "compare")

@@ -54,12 +54,12 @@ def to_eye(positions: np.ndarray, view: bpy.types.RegionView3D) -> np.ndarray:
 
 
 def oracle(view: bpy.types.RegionView3D, names: set[str]) -> dict[str, tuple[np.ndarray, ...]]:
-    """By name: positions and normals (p, 3) of now, and radiance (p, 3) towards the eye, from the CPU alone; dimmed
-    where the panel says stale."""
+    """By full name: positions and normals (p, 3) of now, and radiance (p, 3) towards the eye, from the CPU alone;
+    dimmed where the panel says stale."""
     stored, relighting = core("prt_addon.blender.stored"), core("prt_addon.relighting.exit_radiance")
     moves, relit = core("prt_addon.relighting.moved_light"), core("operators.relit").relit
     scene = bpy.context.scene
-    baked = {o.name: stored.read_baked(o) for o in stored.baked_objects(scene) if o.name in names}
+    baked = {o.name_full: stored.read_baked(o) for o in stored.baked_objects(scene) if o.name in names}
     lit, stale = relit(scene, baked), {line.name for line in bpy.context.window_manager.prt.objects if line.stale}
     result = {}
     for name, transfer in baked.items():
@@ -106,7 +106,7 @@ def _hits(depsgraph: bpy.types.Depsgraph, found: str, position: np.ndarray, acro
         ends.append(Vector(end[:3] / end[3]))
     ray = ends[1] - ends[0]
     hit, where, _, _, thing, _ = bpy.context.scene.ray_cast(depsgraph, ends[0], ray.normalized(), distance=ray.length)
-    return hit and thing.name == found and (where - Vector(position)).length < 0.12
+    return hit and thing.name_full == found and (where - Vector(position)).length < 0.12
 
 
 def displayed(radiance: np.ndarray, shading: bpy.types.View3DShading) -> np.ndarray:

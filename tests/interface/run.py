@@ -31,12 +31,14 @@ SCRIPTS = {
     "interface": ("in_blender.py", "make_scene.py"),
     "lamps": ("lamps_in_blender.py", "make_room.py"),
     "faults": ("faults_in_blender.py", "make_scene.py"),
+    "losses": ("losses_in_blender.py", "make_scene.py"),
     "killed": ("killed_in_blender.py", "make_scene.py"),
     "untouched": ("untouched_in_blender.py", "make_scene.py"),
     "presets": ("presets_in_blender.py", "make_scene.py"),
     "compare": ("compare_in_blender.py", "make_scene.py"),
     "views": ("views_in_blender.py", "make_views.py"),
     "changes": ("changes_in_blender.py", "make_views.py"),
+    "display": ("display_in_blender.py", "make_display.py"),
 }
 RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
