@@ -8,7 +8,7 @@ from collections.abc import Callable
 import bpy
 from bpy.props import StringProperty
 
-from ..prt_addon.blender.light_state import is_on, lights_of, set_light
+from ..prt_addon.blender.light_state import TAKES_OVER, is_on, lights_of, set_light
 from ..prt_addon.errors import BadScene, PRTError
 from .light_design import end_solo, preset_named, recall, solo, store
 from .light_properties import unique_name
@@ -34,7 +34,10 @@ class _LightOperator(bpy.types.Operator):
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"WARNING"} if notes else {"INFO"}, "; ".join([text, *notes]))
+        # Who keys one preset after the other expects it of keyframes to take over.
+        expected = TAKES_OVER.format("")
+        self.report({"INFO"} if all(note.endswith(expected) for note in notes) else {"WARNING"},
+                    "; ".join([text, *notes]))
         context.view_layer.update()
         redraw("UI")
         return {"FINISHED"}

@@ -17,6 +17,7 @@ from .nodes import origin_of, path_of, reachable
 
 State = dict[str, Any]
 SCHEMA = 1
+TAKES_OVER = "{}: it is animated: key it, or its keyframes take over at the next frame"
 SWITCHES = ("hide_viewport", "hide_render")
 ROTATIONS = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
 PLACE = ("location", "rotation_mode", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
@@ -246,7 +247,7 @@ def _assign(owner: bpy.types.ID, holder: bpy.types.bpy_struct, values: State, su
         animated = holder.id_data
     keyed = animated_paths(animated or owner)
     if keyed and any(holder.path_from_id(name) in keyed for name in changed):
-        notes.append(f"{subject}: it is animated, so its keyframes take over at the next frame")
+        notes.append(TAKES_OVER.format(subject))
 
 
 def _linked(subject: str) -> str:
