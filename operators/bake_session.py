@@ -32,6 +32,7 @@ from ..prt_addon.blender.fingerprint import fingerprint, surroundings
 from ..prt_addon.blender.light_region import light_regions
 from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
+from ..prt_addon.blender.own_colours import drop_own_colours
 from ..prt_addon.blender.read_scene import read_objects, selected_names
 from ..prt_addon.blender.stored import stale, write_baked
 from ..prt_addon.blender.stored_report import store_report
@@ -218,6 +219,7 @@ class BakeSession:
                            "Undo that and bake again: the finished bake is taken up at once")
         for name, target in found.items():
             if target is not None:
+                drop_own_colours(target)  # the bake may come to lie on the own mesh, whose colours are one per point
                 write_baked(target, result.objects[name], self.digests[name], self.surroundings)
         store_report(self.scene.find(), result.report)
         self.notes += [f"{name} was deleted meanwhile, and its bake dropped" for name in gone]

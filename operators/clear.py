@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..prt_addon.blender.own_colours import drop_own_colours
 from ..prt_addon.blender.stored import baked_objects, clear_baked, clear_orphans
 from ..prt_addon.blender.stored_report import clear_report
 from ..prt_addon.blender.visibility import find_objects
@@ -43,6 +44,7 @@ class PRT_OT_clear(bpy.types.Operator):
             named = find_objects(names_of(self.objects), context.scene) if self.objects else None
             chosen = [o for o in baked if (o in named if named else o.select_get())] or ([] if named else baked)
             for baked_object in chosen:
+                drop_own_colours(baked_object)
                 clear_baked(baked_object)
             if len(chosen) == len(baked):
                 clear_report(context.scene)

@@ -17,6 +17,7 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ..prt_addon.blender.fingerprint import surroundings
+from ..prt_addon.blender.own_colours import can_show, own_corners, write_own_colours
 from ..prt_addon.blender.stored import baked_mesh, baked_objects, read_baked, stale
 from ..prt_addon.blender.world import needs_cycles
 from ..prt_addon.errors import BadScene, PRTError
@@ -33,6 +34,7 @@ class _Follower:
     """What stays from frame to frame: bakes as they were read, and shadows as long as nothing moves."""
 
     baked: dict[str, tuple[int, str, BakedTransfer]] = field(default_factory=dict)
+    corners: dict[str, tuple[BakedTransfer, np.ndarray]] = field(default_factory=dict)
     around: dict[str, str] | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
     message: str = ""
@@ -72,7 +74,19 @@ def write_frame(scene: bpy.types.Scene) -> list[str]:
             notes.append(f"{name}: its light is no number")
             continue
         write_colours(baked_mesh(scene.objects[name]), radiance)
+        _write_own(scene.objects[name], baked[name], radiance)
     return notes
+
+
+def _write_own(baked_object: bpy.types.Object, baked: BakedTransfer, radiance: np.ndarray) -> None:
+    """The same on the object's own mesh where renders do not show the one that carries the bake."""
+    if not can_show(baked_object):
+        return
+    corners = _follower.corners.get(baked_object.name)
+    if corners is None or corners[0] is not baked or len(corners[1]) != len(baked_object.data.loops):
+        corners = baked, own_corners(baked_object, baked)
+        _follower.corners[baked_object.name] = corners
+    write_own_colours(baked_object.data, radiance[corners[1]])
 
 
 def _readable(scene: bpy.types.Scene) -> tuple[dict[str, BakedTransfer], list[str]]:

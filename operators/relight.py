@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ..prt_addon.blender.fingerprint import RELIT_ATTRIBUTE
+from ..prt_addon.blender.own_colours import can_show, own_corners, write_own_colours
 from ..prt_addon.blender.stored import baked_mesh
 from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError, StorageError
@@ -69,7 +70,10 @@ class PRT_OT_relight(bpy.types.Operator):
                 save_arrays(path_of(self.filepath), radiance_arrays(baked, lit))
             objects = dict(zip(baked, find_objects(list(baked), scene), strict=True))
             for name, transfer in ({} if self.filepath else baked).items():
-                write_colours(baked_mesh(objects[name]), lit.radiance(name, transfer))
+                radiance = lit.radiance(name, transfer)
+                write_colours(baked_mesh(objects[name]), radiance)
+                if can_show(objects[name]):
+                    write_own_colours(objects[name].data, radiance[own_corners(objects[name], transfer)])
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -81,7 +85,7 @@ class PRT_OT_relight(bpy.types.Operator):
         carriers = [name for name in baked if baked_mesh(objects[name]) != objects[name].data]
         text = f"Lit {len(baked)} object{'' if len(baked) == 1 else 's'}"
         if carriers:
-            text += f"; of {', '.join(carriers)} the attribute is on the hidden receiver mesh"
+            text += f"; of {', '.join(carriers)} in full on the hidden receiver mesh, and as fine as their own mesh is"
         self.report({"INFO"}, text)
         if session(context).preview:
             context.view_layer.update()

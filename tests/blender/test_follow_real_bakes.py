@@ -38,8 +38,9 @@ def registered() -> Iterator[None]:
         bpy.utils.unregister_class(cls)
 
 
-def add_checker_to_the_ball() -> None:
-    """An image through a UV map: the stand-in material then changes what the geometry is told by."""
+def paint_the_ball_and_add_a_box() -> None:
+    """An image through a UV map: the stand-in material then changes what the geometry is told by. The box's flat faces
+    need more receivers than it has vertices, so its bake lies on a hidden mesh."""
     image = bpy.data.images.new("Checker", 8, 8)
     image.pixels.foreach_set(np.random.default_rng(1).random(8 * 8 * 4, np.float32))
     image.pack()
@@ -49,6 +50,9 @@ def add_checker_to_the_ball() -> None:
     texture.image = image
     tree.links.new(texture.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
     bpy.data.objects["Ball"].data.materials.append(material)
+    bpy.ops.mesh.primitive_cube_add(size=1.0, location=(-2.0, -1.0, 0.55), rotation=(0.0, 0.0, 0.4))
+    bpy.context.object.name = bpy.context.object.data.name = "Box"
+    bpy.context.object.data.materials.append(bpy.data.materials.new("Plain"))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +60,7 @@ def animated(tmp_path_factory: pytest.TempPathFactory, registered: None) -> Path
     """A baked ball and floor; on frame 2 the Sun is elsewhere, red and stronger and the World darker, and on frame 3
     the Sun is off in renders."""
     folder = tmp_path_factory.mktemp("animated")
-    source, output = make_scene(folder / "scene.blend", add_checker_to_the_ball), folder / "baked.blend"
+    source, output = make_scene(folder / "scene.blend", paint_the_ball_and_add_a_box), folder / "baked.blend"
     assert run("bake", "--input", source, "--output", output, *FAST) == 0
     bpy.ops.wm.open_mainfile(filepath=str(output))
     scene, sun = bpy.context.scene, bpy.data.objects["Sun"]
@@ -101,7 +105,7 @@ def relit_material() -> bpy.types.Material:
 
 
 def on_the_objects(scene: bpy.types.Scene) -> None:
-    for name in ("Ball", "Floor"):
+    for name in ("Ball", "Floor", "Box"):
         bpy.data.objects[name].data.materials[0] = relit_material()
 
 
@@ -167,12 +171,43 @@ def test_a_render_shows_what_relight_gives_on_each_frame(animated: Path, tmp_pat
         assert np.abs(pictures[one] - pictures[other]).max() > 0.1, (one, other)
 
 
-def pixel_of(scene: bpy.types.Scene) -> tuple[int, int]:
+def test_an_object_whose_bake_is_on_a_hidden_mesh_shows_it_too(animated: Path, tmp_path: Path) -> None:
+    """Each corner of the Box has the colour of the receiver at its place that faces its way; renders show them, and
+    nothing stays after the bake is dropped."""
+    from prt.prt_addon.blender.own_colours import drop_own_colours
+    from prt.prt_addon.blender.stored import baked_mesh, read_baked
+
+    expected = {frame: relit_by_command(animated, tmp_path, frame)["Box"] for frame in (1, 2)}
+    scene = opened(animated)
+    box = bpy.data.objects["Box"]
+    on_the_objects(scene)
+    assert baked_mesh(box) != box.data and "PRT Light" not in box.data.attributes
+    scene.prt_light.follow_frames = True
+    receivers = read_baked(box)
+    for frame in (1, 2):
+        scene.frame_set(frame)
+        assert scene.prt_light.follow_message == ""
+        found = np.empty((len(box.data.loops), 4), np.float32)
+        box.data.attributes["PRT Light"].data.foreach_get("color", found.ravel())
+        for loop, colour in zip(box.data.loops, found[:, :3], strict=True):
+            place = np.array(box.matrix_world @ box.data.vertices[loop.vertex_index].co)
+            normal = np.array(box.matrix_world.to_3x3() @ box.data.corner_normals[loop.index].vector)
+            there = (np.abs(receivers.positions - place).max(axis=1) < 1e-4) & (receivers.normals @ normal > 0.999)
+            assert there.sum() == 1 and np.allclose(expected[frame][there][0], colour, atol=1e-5)
+    pictures = rendered(scene, tmp_path)
+    row, column = pixel_of(scene, tuple(box.matrix_world.translation + box.matrix_world.to_3x3().col[2] * 0.5))
+    assert pictures[1][row, column].min() > 0.02, "the box is black"
+    assert np.abs(pictures[1][row, column] - pictures[2][row, column]).max() > 0.05
+    drop_own_colours(box)
+    assert "PRT Light" not in box.data.attributes
+
+
+def pixel_of(scene: bpy.types.Scene, looked_at: tuple[float, ...] = LOOKED_AT) -> tuple[int, int]:
     """Row from the bottom and column of the place that is looked at."""
     from bpy_extras.object_utils import world_to_camera_view
     from mathutils import Vector
 
-    place = world_to_camera_view(scene, scene.camera, Vector(LOOKED_AT))
+    place = world_to_camera_view(scene, scene.camera, Vector(looked_at))
     return int(place.y * SIZE), int(place.x * SIZE)
 
 
