@@ -391,9 +391,9 @@ def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
     header, own = baked.header, baked.header.get("own_errors", {})
     only_lamps = header.get("settings", {}).get("lighting") == "local"
     keys = {"diffuse": None if only_lamps else "errors",
-            "highlights": "highlight_errors" if baked.functions else None,
+            "highlights": "highlight_errors" if len(baked.functions) > 1 else None,
             "bounced light of lamps": "errors" if only_lamps else "local_errors",
-            "highlights of lamps": "local_highlight_errors" if baked.functions else None}
+            "highlights of lamps": "local_highlight_errors" if len(baked.functions) > 1 else None}
     found = []
     for part, key in keys.items():
         mine = own.get("diffuse" if only_lamps and key == "errors" else part) if key else None

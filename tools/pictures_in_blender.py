@@ -73,6 +73,7 @@ def set_up() -> Step:
     space = area().spaces.active
     space.show_region_ui, space.show_gizmo, space.overlay.show_floor = True, False, False
     space.overlay.show_axis_x = space.overlay.show_axis_y = space.overlay.show_cursor = False
+    space.overlay.show_text = False
     space.region_3d.view_perspective = "CAMERA"
     bpy.context.scene.camera.data.passepartout_alpha = 1.0
     with override():
@@ -153,7 +154,7 @@ def drag_a_lamp() -> Step:
     lamp.data.energy, lamp.data.color, lamp.data.shadow_soft_size = 90.0, (1.0, 0.82, 0.6), 0.15
     scene.collection.objects.link(lamp)
     lamp.location = (0.9, -1.9, 1.5)
-    scene.prt.preset, scene.prt.lighting = "draft", "both"
+    scene.prt.preset, scene.prt.lighting = "standard", "both"
     assert invoke_bake() == {"RUNNING_MODAL"}
     yield from wait_for_bake()
     assert not session().failed, session().message
@@ -163,12 +164,12 @@ def drag_a_lamp() -> Step:
     frames = []
     for number in range(FRAMES):
         angle = 2.0 * math.pi * number / FRAMES
-        lamp.location = (1.6 * math.cos(angle) + 0.2, 1.5 * math.sin(angle) - 0.9, 1.35 + 0.25 * math.sin(2.0 * angle))
+        lamp.location = (1.2 * math.cos(angle) + 0.5, 0.9 * math.sin(angle) - 1.1, 1.6 + 0.25 * math.sin(2.0 * angle))
         yield 1.2
         shoot(f"lamp_{number:02}")
         frames.append(str(OUTPUT / f"lamp_{number:02}.png"))
     subprocess.run(["convert", "-delay", str(FRAME_TIME), *frames, "-crop", view, "+repage", "-resize", "480x",
-                    "-colors", "96", "-layers", "Optimize", "-loop", "0", str(SHOWN / "lamp.gif")], check=True,
+                    "-colors", "160", "-layers", "Optimize", "-loop", "0", str(SHOWN / "lamp.gif")], check=True,
                    timeout=120)
 
 
