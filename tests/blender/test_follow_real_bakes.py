@@ -172,10 +172,10 @@ def test_a_render_shows_what_relight_gives_on_each_frame(animated: Path, tmp_pat
 
 
 def test_an_object_whose_bake_is_on_a_hidden_mesh_shows_it_too(animated: Path, tmp_path: Path) -> None:
-    """Each corner of the Box has the colour of the receiver at its place that faces its way; renders show them, and
-    nothing stays after the bake is dropped."""
-    from prt.prt_addon.blender.own_colours import drop_own_colours
-    from prt.prt_addon.blender.stored import baked_mesh, read_baked
+    """Each corner of the Box has the colour of the receiver at its place that faces its way; renders show them, and a
+    new bake, which under the same materials is no stale one, starts without them."""
+    from prt.prt_addon.blender.fingerprint import surroundings
+    from prt.prt_addon.blender.stored import baked_mesh, read_baked, stale
 
     expected = {frame: relit_by_command(animated, tmp_path, frame)["Box"] for frame in (1, 2)}
     scene = opened(animated)
@@ -198,8 +198,14 @@ def test_an_object_whose_bake_is_on_a_hidden_mesh_shows_it_too(animated: Path, t
     row, column = pixel_of(scene, tuple(box.matrix_world.translation + box.matrix_world.to_3x3().col[2] * 0.5))
     assert pictures[1][row, column].min() > 0.02, "the box is black"
     assert np.abs(pictures[1][row, column] - pictures[2][row, column]).max() > 0.05
-    drop_own_colours(box)
+    scene.prt_light.follow_frames = False
+    source, output = tmp_path / "lit.blend", tmp_path / "again.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(source))
+    assert run("bake", "--input", source, "--output", output, *FAST) == 0
+    opened(output)
+    box, depsgraph = bpy.data.objects["Box"], bpy.context.evaluated_depsgraph_get()
     assert "PRT Light" not in box.data.attributes
+    assert stale(box, depsgraph, surroundings(depsgraph)) is None
 
 
 def pixel_of(scene: bpy.types.Scene, looked_at: tuple[float, ...] = LOOKED_AT) -> tuple[int, int]:
