@@ -24,7 +24,7 @@ def texts(files: list[Path]) -> list[tuple[str, str]]:
     found = []
     for path in files:
         name = str(path.relative_to(ROOT))
-        if name != "LICENSE" and path.suffix not in (".png", ".npz", ".exr", ".blend"):
+        if name != "LICENSE" and path.suffix not in (".png", ".gif", ".npz", ".exr", ".blend"):
             found.append((name, path.read_text("utf-8")))
     return found
 
