@@ -330,7 +330,9 @@ def _read_attribute(mesh: bpy.types.Mesh, name: str, least_width: int, subject: 
     """Values (p,) or (p, width); a conversion that keeps at least `least_width` numbers per point loses nothing."""
     attribute = mesh.attributes.get(name)
     member, width, dtype = MEMBERS.get(attribute.data_type, NOTHING) if attribute is not None else NOTHING
-    if attribute is None or attribute.domain != "POINT" or width < least_width or (width > 1) != (least_width > 1):
+    fits = width >= least_width and (width > 1) == (least_width > 1)
+    single = width == 1 and dtype != np.int32  # single values are numbers of clusters and materials
+    if attribute is None or attribute.domain != "POINT" or not fits or single:
         raise StorageError(subject, f"the attribute {name} of its baked data is missing or was converted",
                            container.REBAKE)
     values = np.empty(len(attribute.data) * width, dtype)

@@ -92,7 +92,7 @@ def _attention(report: Report) -> str:
     if not lines and not hints:
         return ""
     failed = bool(_failed(report))
-    items = "".join(f"<li>{escape(line[:1].upper() + line[1:])}</li>" for line in [*lines, *hints])
+    items = "".join(f"<li>{escape(line)}</li>" for line in [*lines, *hints])
     return _section("Needs a look" if failed else "Notes", f"<ul>{items}</ul>", style="attention" if failed else "")
 
 
