@@ -154,7 +154,7 @@ def drag_a_lamp() -> Step:
     lamp.data.energy, lamp.data.color, lamp.data.shadow_soft_size = 90.0, (1.0, 0.82, 0.6), 0.15
     scene.collection.objects.link(lamp)
     lamp.location = (0.9, -1.9, 1.5)
-    scene.prt.preset, scene.prt.lighting = "standard", "both"
+    scene.prt.preset, scene.prt.lighting = "draft", "both"
     assert invoke_bake() == {"RUNNING_MODAL"}
     yield from wait_for_bake()
     assert not session().failed, session().message
