@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import bpy
 
-from ..prt_addon.blender.stored import baked_mesh
 from .arguments import path_of, size_in, size_of
 from .compare_session import CompareRequest
 from .job_mixin import JobMixin
 from .place import Place
+from .polls import refuse, why_not_drawn
 
 
 class PRT_OT_compare(JobMixin, bpy.types.Operator):
@@ -37,16 +37,7 @@ class PRT_OT_compare(JobMixin, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Leave edit mode first: the bakes can't be read in it")
-            return False
-        if not any(baked_mesh(o) is not None for o in context.scene.objects):
-            cls.poll_message_set("Nothing is baked: bake an object first")
-            return False
-        if context.scene.camera is None:
-            cls.poll_message_set("There is no active camera, whose view could be compared: add one")
-            return False
-        return True
+        return refuse(cls, why_not_drawn(context, "compared"))
 
     def make_request(self, context: bpy.types.Context) -> CompareRequest:
         """The camera's view of this scene, with the panel's settings where no others are given."""

@@ -9,9 +9,9 @@ from pathlib import Path
 import bpy
 
 from ..prt_addon.blender.lights import environment_picture
-from ..prt_addon.blender.stored import baked_mesh
 from ..prt_addon.errors import BadArguments, PRTError
 from .arguments import path_of, size_in, size_of
+from .polls import refuse, why_not_drawn
 from .relit import draw_lit, read_all, relit
 
 
@@ -61,16 +61,7 @@ class PRT_OT_draw_camera(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Leave edit mode first: the bakes can't be read in it")
-            return False
-        if not any(baked_mesh(o) is not None for o in context.scene.objects):
-            cls.poll_message_set("Nothing is baked: bake an object first")
-            return False
-        if context.scene.camera is None:
-            cls.poll_message_set("There is no active camera, whose view could be drawn: add one")
-            return False
-        return True
+        return refuse(cls, why_not_drawn(context, "drawn"))
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if not self.filepath:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import bpy
 
-from ..prt_addon.blender.stored import baked_mesh
 from ..prt_addon.errors import BadArguments, PRTError, StorageError
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.files import save_arrays, save_json
 from .arguments import path_of
+from .polls import refuse, why_not_read
 from .relit import read_all
 
 # What is written of each object, described for whoever reads it without this program.
@@ -83,13 +83,7 @@ class PRT_OT_export(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Leave edit mode first: the bakes can't be read in it")
-            return False
-        if not any(baked_mesh(o) is not None for o in context.scene.objects):
-            cls.poll_message_set("Nothing is baked: bake an object first")
-            return False
-        return True
+        return refuse(cls, why_not_read(context))
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)

@@ -13,6 +13,7 @@ from ..prt_addon.blender.visibility import find_objects
 from ..prt_addon.errors import PRTError, StorageError
 from ..prt_addon.storage.files import save_arrays
 from .arguments import path_of
+from .polls import refuse, why_not_read
 from .properties import session
 from .relit import radiance_arrays, read_all, relit
 
@@ -51,13 +52,7 @@ class PRT_OT_relight(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Leave edit mode first: the bakes can't be read in it")
-            return False
-        if not any(baked_mesh(o) is not None for o in context.scene.objects):
-            cls.poll_message_set("Nothing is baked: bake an object first")
-            return False
-        return True
+        return refuse(cls, why_not_read(context))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene

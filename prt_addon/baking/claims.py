@@ -88,28 +88,28 @@ class Claim:
             return []
 
 
+def _taken_if_free(folder: Path) -> Claim | None:
+    """A claim of a folder in which nobody works; None, too, where it can't be written."""
+    try:
+        return Claim.take(folder)
+    except OSError:
+        return None
+
+
 def is_free(folder: Path) -> bool:
     """Whether no living process works in a folder. False, too, where it can't be written."""
-    try:
-        claim = Claim.take(folder)
-    except OSError:
-        return False
-    if claim is None:
-        return False
-    claim.release()
-    return True
+    claim = _taken_if_free(folder)
+    if claim is not None:
+        claim.release()
+    return claim is not None
 
 
 def discard_if_free(folder: Path) -> bool:
     """Remove a folder in which nobody works; False where somebody does."""
-    try:
-        claim = Claim.take(folder)
-    except OSError:
-        return False
-    if claim is None:
-        return False
-    claim.discard()
-    return True
+    claim = _taken_if_free(folder)
+    if claim is not None:
+        claim.discard()
+    return claim is not None
 
 
 def _unlink(path: Path) -> None:
