@@ -8,6 +8,7 @@ import bpy
 from .jobs import draw_interrupted, draw_jobs, draw_messages
 from .layout import Sidebar, plural, wrapped
 
+CASTING = "more mesh casts shadows and bounces", "more meshes cast shadows and bounce"  # one, several
 NAMES = 3  # of objects that are told
 TOLD_AS = {"Left out:": "REMOVE", "Bake:": "ERROR"}  # icons of an analysis' lines by how they start
 
@@ -70,8 +71,7 @@ def _what_is_baked(context: bpy.types.Context) -> list[tuple[str, str]]:
     others = len(shown) - len(chosen)
     if others <= 0:
         return [(names, "MESH_DATA")]
-    return [(names, "MESH_DATA"), (f"{plural(others, 'more mesh', 'more meshes')} cast shadows and bounce light",
-                                   "LIGHT_SUN")]
+    return [(names, "MESH_DATA"), (f"{plural(others, *CASTING)} light", "LIGHT_SUN")]
 
 
 def _light_warnings(context: bpy.types.Context) -> list[str]:
