@@ -21,7 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -55,6 +56,15 @@ class Blender:
     def __init__(self, ui: str, headless: str, output: Path, resources: Path) -> None:
         self.ui, self.headless, self.output = shlex.split(ui), shlex.split(headless), output
         self.environment = {**os.environ, "BLENDER_USER_RESOURCES": str(resources)}
+
+    @contextmanager
+    def apart(self) -> Iterator[Blender]:
+        """This Blender with a copy of its preferences and extensions, as scripts may leave them otherwise: one that
+        disables the extension takes its wheels from the next one's Blender."""
+        with tempfile.TemporaryDirectory() as folder:
+            resources = Path(folder) / "resources"
+            shutil.copytree(self.environment["BLENDER_USER_RESOURCES"], resources, symlinks=True)
+            yield Blender(shlex.join(self.ui), shlex.join(self.headless), self.output, resources)
 
     def command(self, *arguments: str, seconds: float = COMMAND_SECONDS) -> subprocess.CompletedProcess[str]:
         """Run in background mode."""
@@ -253,10 +263,12 @@ def main() -> int:
             outcomes.append(run_check(check_kill_among_lamps, blender, make_scene(blender, "make_room.py", outcomes)))
         for name, (script, maker) in SCRIPTS.items():
             if arguments.only in (None, name):
-                outcomes += interface_results(blender, script, f"{name}.json", make_scene(blender, maker, outcomes))
+                with blender.apart() as own:
+                    outcomes += interface_results(own, script, f"{name}.json", make_scene(own, maker, outcomes))
         if arguments.only in (None, "vulkan"):
             script, maker = SCRIPTS["views"]
-            outcomes += interface_results(blender, script, "views.json", make_scene(blender, maker, outcomes), True)
+            with blender.apart() as own:
+                outcomes += interface_results(own, script, "views.json", make_scene(own, maker, outcomes), True)
     for name, failure in outcomes:
         print(f"{'failed' if failure else 'passed'}: {name}" + (f"\n    {failure}" if failure else ""))
     failed = sum(bool(failure) for _, failure in outcomes)
