@@ -23,6 +23,7 @@ from ..basis.directions import quadrature
 from ..compression.coherence import Coherence, make_coherent
 from ..compression.eigentransport import eigentransport
 from ..compression.encoding import Encoding, encode
+from ..compression.global_frame import rows_at_once
 from ..compression.groups import encode_groups
 from ..compression.point_errors import point_errors
 from ..compression.settings import EncoderSettings
@@ -89,8 +90,6 @@ DIRECTIONS_OF_CHECKS = 256
 LEAST_DIFFUSE = 0.05
 # Share of glossy surfaces among what glossy receivers see from which on their light is followed by its direction.
 LEAST_GLOSSY_HITS = 0.01
-# Receivers whose rows are copied at once.
-ROWS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
@@ -835,8 +834,9 @@ class _Bake:
 def _energy(signal: NDArray[np.float32], metric: NDArray[np.float64] | None) -> float:
     """Sum of squares of a signal (p, rows, columns, channels), in the metric of its rows."""
     total = 0.0
-    for start in range(0, len(signal), ROWS_AT_ONCE):
-        block = signal[start:start + ROWS_AT_ONCE]
+    at_once = rows_at_once(signal[:1].size)
+    for start in range(0, len(signal), at_once):
+        block = signal[start:start + at_once]
         if metric is None:
             total += float(np.sum(np.square(block, dtype=np.float64)))
         else:
@@ -858,8 +858,9 @@ class GlossyRows:
         One channel serves all three.
         """
         inside = np.flatnonzero((self.points >= place.start) & (self.points < place.stop))
-        for start in range(0, len(inside), ROWS_AT_ONCE):
-            block = inside[start:start + ROWS_AT_ONCE]
+        at_once = rows_at_once(self.rows[:1].size)
+        for start in range(0, len(inside), at_once):
+            block = inside[start:start + at_once]
             signal[self.points[block] - place.start] = self.rows[block]
 
     def at(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
