@@ -50,7 +50,7 @@ class BakeSettings:
     subsurface: whether light travels through translucent materials.
     distant_basis: what World and Suns are baked in. "sh": spherical harmonics of `order`. "cubemap": the texels of a
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
-        harmonics blur them. Costs memory and time with the texels' number; diffuse light only.
+        harmonics blur them. Costs memory and time with the texels' number, highlights with that of their rows too.
     memory_budget: GB of transfer kept in memory while a cubemap is baked; what is more goes to a file; 0 = no limit.
     fit_order_to_light: lower the order to what the scene's present light carries.
     lighting: "environment" (World and Suns), "local" (lamps that move within a light cloud), or both with a comma.
