@@ -39,9 +39,9 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
-        if settings.distant_basis == "cubemap":
+        if settings.distant_basis != "sh":
             distant.prop(settings, "memory_budget")
-        else:
+        if settings.distant_basis == "sh":
             distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")
@@ -55,7 +55,7 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
-        column.active = settings.distant_basis == "sh" or settings.lighting == "local"  # a cubemap holds none
+        column.active = settings.distant_basis != "cubemap" or settings.lighting == "local"  # a cubemap holds none
         column.prop(settings, "glossy_rows")
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
