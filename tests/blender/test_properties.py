@@ -21,7 +21,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
 
 # Of the preview alone, or turned into a field of another name.
 NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection",
-              "compare_samples", "compare_percentage", "display", "show_cloud"}
+              "compare_samples", "compare_percentage", "display", "show_cloud", "lamps_by_directions"}
 
 
 @pytest.fixture
