@@ -6,6 +6,7 @@ Reading order is data order:
     render_data.py   pure numpy: a BakedTransfer as the arrays that go to the GPU, and the signatures that say when
                      they changed. Never imports gpu or bpy.
     hemisphere_glsl.py   pure text: the functions of the view as GLSL.
+    compute_program.py  a compute program described once, for Blender and as plain GLSL
     programs.py      GLSL files -> the programs (cached; released by `programs.release`).
     image_textures.py   vertices that carry places in image textures, and the images as Blender holds them
     draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
