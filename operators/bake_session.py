@@ -20,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
+from ..prt_addon.baking.basis_choice import choose_basis
 from ..prt_addon.baking.claims import Claim, discard_if_free
+from ..prt_addon.baking.distant_basis import distant_basis
 from ..prt_addon.baking.local_lights import fit_to_lamps
 from ..prt_addon.baking.memory import memory_warning
 from ..prt_addon.baking.plan import make_plan
@@ -91,7 +93,12 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
     """What a bake of the scene would need, leave out and cost, as JSON-able values."""
     scene = read_scene(depsgraph, settings, targets)
     settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
-    plan = make_plan(scene, transport_settings(settings), reference_light(depsgraph))
+    light = reference_light(depsgraph)
+    # In Blender's own process nothing starts threads (design/architecture.md).
+    settings, choice = choose_basis(scene, settings, light, threads=1)
+    settings = transport_settings(settings)
+    plan = make_plan(scene, settings, light)
+    basis = distant_basis(settings, plan.needs.order) if settings.distant_light else None
     try:
         too_much = memory_warning(plan, settings)
     except BadScene as error:  # an analysis tells it and goes on
@@ -102,7 +109,9 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
         "receivers": plan.receivers,
         "triangles": len(scene.triangles),
         "needs": {"shadow_rays": plan.needs.shadow_rays, "bounces": plan.needs.bounces,
-                  "channels": plan.needs.channels, "order": plan.needs.order},
+                  "channels": plan.needs.channels, **(basis.facts if basis else {})},
+        "basis": basis.words if basis else "",
+        "choice": None if choice is None else choice.facts,
         "left_out": [asdict(item) for item in plan.needs.left_out],
         "hints": list(plan.needs.hints),
         "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *left_out],
@@ -123,7 +132,8 @@ def analysis_lines(analysis: dict[str, Any]) -> list[str]:
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
     told = [line for line in analysis["warnings"] if line.startswith("Bake: ")]  # of memory: first, as it may end it
     rest = [line for line in analysis["warnings"] if line not in told]
-    return lines[:1] + told + lines[1:] + analysis["hints"] + rest
+    basis = [analysis["choice"]["line"]] if analysis["choice"] else [analysis["basis"]] * bool(analysis["basis"])
+    return lines[:1] + told + basis + lines[1:] + analysis["hints"] + rest
 
 
 @dataclass

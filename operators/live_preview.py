@@ -47,6 +47,7 @@ from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
+from .distant_lamps import DistantLamps
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
 
@@ -114,6 +115,7 @@ class Live:
     message: str = ""
     light: DistantLight | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
+    far_lamps: DistantLamps = field(default_factory=DistantLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
     lamps_time: float = 0.0
@@ -317,6 +319,7 @@ def _read_bakes() -> None:
     bakes = _bakes_here()
     _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known(bakes)
     _live.lamps.forget_geometry()
+    _live.far_lamps.forget_geometry()
     layer = {found.name_full for found in bpy.context.view_layer.objects}
     for name, (found, owner, local) in bakes.items():
         line = Line(name)
@@ -411,6 +414,7 @@ def _read_stale() -> None:
     if around != _live.around:
         _live.around = around
         _live.lamps.forget_geometry()
+        _live.far_lamps.forget_geometry()
     bakes, changed = _bakes_here(), False
     for line in _live.lines:
         shown = _live.shown.get(line.name)
@@ -440,11 +444,13 @@ def _read_light() -> None:
         _live.signature, _live.light, _live.message = None, None, ""
         return
     started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
-    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
+    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values()) and \
+        not bpy.context.scene.prt.lamps_by_directions
     distant, warnings, signature = distant_light(
         bpy.context.scene, depsgraph, (shown.baked.lighting_basis for shown in _live.shown.values()),
         window=bpy.context.scene.prt.window, name_lamps=name_lamps)
     _read_lamps(depsgraph, warnings)
+    _read_far_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
     _live.message = "\n".join(dict.fromkeys(warnings))
     if signature != _live.signature:
@@ -470,6 +476,21 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     if not _live.lamps.settled:
         _live.light_dirty = True
         viewport.redraw()
+
+
+def _read_far_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
+    """Let lamps light bakes without columns of their own, where that is asked for."""
+    settings, outside = bpy.context.scene.prt, []
+    bakes = {name: shown.baked for name, shown in _live.shown.items() if shown.baked.cloud is None}
+    if settings.lamps_by_directions and bakes:
+        owners = {name: _live.shown[name].owner for name in bakes}
+        outside = _live.far_lamps.step(bakes, depsgraph, warnings, owners)
+    for name, baked in bakes.items():
+        shown = _live.shown[name]
+        direct = _live.far_lamps.direct(name, baked, outside, settings.window, shown.moved)
+        if direct is not shown.direct:
+            shown.direct = direct
+            viewport.redraw()
 
 
 def _note_moves(lamps: list[LocalLight], now: float) -> None:

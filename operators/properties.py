@@ -59,12 +59,16 @@ ENCODER_ITEMS = (
                              "twice the time", 2),
     ("eigentransport", "Eigentransport", "One basis for all receivers, with more vectors. Relights fast; needs about a "
                                          "hundred vectors, and blurs or rings in hard shadows", 3),
+    ("auto", "Automatic", "Clusters; of a cubemap eigentransport where that shows the present light as exactly for "
+                          "less time and data. Analyze tells which", 4),
 )
 DISTANT_BASIS_ITEMS = (
     ("sh", "Spherical Harmonics", "Smooth functions: small, fast, with highlights and translucency. A sun's shadows "
                                   "are as soft as the order says", 0),
     ("cubemap", "Cubemap", "The texels of a cubemap: shadows of suns as sharp as a texel. Costs several times the time "
                            "and memory; highlights several times as much again", 1),
+    ("auto", "Automatic", "Harmonics or a cubemap, as large as the present light needs for the asked error. Costs a "
+                          "second; a sharper light that comes later is shown blurred. Analyze tells what and why", 2),
 )
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
@@ -72,7 +76,8 @@ TARGET_ITEMS = (
 )
 # What presets differ in, and so fill in; the rest belongs to the scene rather than to the quality, and stays.
 QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing", "encoder", "clusters", "vectors",
-           "compression_error", "error_receivers", "error_paths", "glossy_rows", "glossy_albedo", "surface_patches",
+           "compression_error", "error_receivers", "error_paths", "glossy_rows", "glossy_albedo", "light_error",
+           "surface_patches",
            "surface_columns", "cloud_lights", "merge_response")
 # What goes into a bake under its own name.
 OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "lamp_basis", "cloud_spacing", "cloud_emission",
@@ -131,6 +136,12 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Sky By", items=DISTANT_BASIS_ITEMS, default=PRESETS["standard"].distant_basis,
         description="What World and Suns are baked in",
     )
+    light_error: FloatProperty(
+        name="Light Error", min=1e-3, max=1.0, soft_max=0.3, precision=3, step=0.5,
+        default=PRESETS["standard"].light_error,
+        description="Share of the shadows of the present light that an automatic sky may lose (relative RMS). Lower "
+                    "buys sharper shadows; time and data grow, under a sun many times",
+    )
     cubemap_size: IntProperty(
         name="Texels", min=2, max=32, default=PRESETS["standard"].cubemap_size,
         description="Along each edge of the cubemap. Twice as many show shadows twice as sharp; time, memory and disk "
@@ -159,6 +170,12 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Show Light Cloud", update=_redraw, default=False,
         description="Marks the lights of the light cloud (grey; merged ones in their zone's colour), or the patches of "
                     "the surfaces that lamps shine on. Costs some drawing while on, nothing while off",
+    )
+    lamps_by_directions: BoolProperty(
+        name="Lamps by Nearest Directions", update=_light_changed, default=False,
+        description="Point, Spot and Area lamps light bakes made without local lights, as light from where they are. "
+                    "Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, at 1.5 "
+                    "radii 14 % off beside a ground. Costs some milliseconds a lamp",
     )
     window: BoolProperty(
         name="Soften Ringing", update=_light_changed, default=False,

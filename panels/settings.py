@@ -39,9 +39,9 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
-        if settings.distant_basis == "cubemap":
+        if settings.distant_basis != "sh":
             distant.prop(settings, "memory_budget")
-        else:
+        if settings.distant_basis == "sh":
             distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")

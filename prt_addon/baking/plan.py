@@ -17,6 +17,7 @@ from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .distant_basis import array_budget, distant_basis
 from .settings import EIGENTRANSPORT, BakeSettings
+from .sparse_choice import note_sparse, sparse_left_out
 from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
@@ -90,6 +91,8 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     needs.left_out += surfaces.left_out
     needs.hints += surfaces.hints
     columns = distant_basis(settings, needs.order).columns
+    if basis.cubemap and needs.shadow_rays:
+        note_sparse(needs, sparse_left_out(receivers, columns))
     values = receivers * columns * needs.channels
     glossy, translucent = int(surfaces.glossy_points(scene).sum()), int(surfaces.translucent_points(scene).sum())
     seconds, rays = {"prepare": 0.2 + 1e-6 * len(scene.triangles)}, {}

@@ -49,6 +49,7 @@ from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, Indirect
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
 from ..transport.texel_visibility import TexelVisibility
+from .basis_choice import BasisChoice, choose_basis
 from .cubemap import bounced_cubemap, by_point, cubemap_signal, direct_cubemap, is_kept, without_scale
 from .distant_basis import distant_basis
 from .error_budget import BakedSample, choose_receivers, error_budget
@@ -71,6 +72,7 @@ from .results import (
     white_world_checks,
 )
 from .settings import EIGENTRANSPORT, BakeSettings
+from .sparse_choice import measured_sparse, note_sparse
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .texel_highlights import (
     columns_through_bodies,
@@ -122,9 +124,10 @@ def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = Non
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
     scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
+    settings, choice = choose_basis(scene, settings, light)
     settings = transport_settings(settings)
     regions = np.empty((0, 4, 4)) if regions is None else regions
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions).run())
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice).run())
 
 
 def transport_settings(settings: BakeSettings) -> BakeSettings:
@@ -147,6 +150,7 @@ class _Bake:
     light: ReferenceLight | None
     digests: dict[str, str]
     regions: NDArray[np.float64]
+    choice: BasisChoice | None = None
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
@@ -342,6 +346,8 @@ class _Bake:
             plain = texel_visibility(chosen, self.basis, self.settings, gathered is not None)
             transfer = yield from self._follow("direct", direct_cubemap(
                 self.tracer, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.folder, plain))
+            if self.plan.needs.shadow_rays:
+                note_sparse(self.plan.needs, measured_sparse(self.tracer, receivers, self.basis, self.settings.seed))
             return receivers, transfer, self._visibility(receivers, transfer, plain)
         if chosen.any():
             plain = HemisphereVisibility(chosen, INCIDENT_ORDER + order - 1, INCIDENT_ORDER if gathered else 0)
@@ -784,6 +790,8 @@ class _Bake:
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
+        report["basis"] = self.basis.words if self.settings.distant_light else ""
+        report["choice"] = None if self.choice is None else self.choice.facts
         if self.local is not None:
             report["local"] = self.local.facts
             report["local_errors"] = self.local_errors

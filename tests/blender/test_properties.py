@@ -21,7 +21,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
 
 # Of the preview alone, or turned into a field of another name.
 NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection",
-              "compare_samples", "compare_percentage", "display", "show_cloud"}
+              "compare_samples", "compare_percentage", "display", "show_cloud", "lamps_by_directions"}
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: b
                                     preferences=types.SimpleNamespace(system=types.SimpleNamespace(ui_scale=1.0)))
     panels = (bake.PRT_PT_bake, expert.PRT_PT_rays, expert.PRT_PT_highlights, expert.PRT_PT_local_lights,
               expert.PRT_PT_compression, preview.PRT_PT_preview, check.PRT_PT_check)
-    for sky, panel in itertools.product(("cubemap", "sh"), panels):
+    for sky, panel in itertools.product(("cubemap", "sh", "auto"), panels):
         settings.distant_basis = sky
         if "poll" not in vars(panel) or panel.poll(context):
             drawing = types.SimpleNamespace(layout=Drawn(found))
