@@ -166,7 +166,8 @@ def measure(context: moderngl.Context, source: str, receivers: int) -> dict[str,
     jacobi(matrix, albedo, emittance, runs)
     cpu = (time.perf_counter() - began) / runs
     return {"receivers": size, "entries": int(matrix.nnz), "gpu_ms": query.elapsed * 1e-6 / times,
-            "wall_ms": wall * 1e3, "read_ms": read * 1e3, "scipy_ms": cpu * 1e3, "factor": cpu / wall, "difference": difference}
+            "wall_ms": wall * 1e3, "read_ms": read * 1e3, "scipy_ms": cpu * 1e3, "factor": cpu / wall,
+            "difference": difference}
 
 
 def main() -> None:

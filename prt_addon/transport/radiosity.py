@@ -26,9 +26,9 @@ from .krylov import SMALLEST, bicgstab_cycle, column_norm, conjugate_gradient_st
 JACOBI, GAUSS_SEIDEL, BICGSTAB, CONJUGATE_GRADIENTS = "jacobi", "gauss-seidel", "bicgstab", "conjugate-gradients"
 METHODS = (JACOBI, GAUSS_SEIDEL, BICGSTAB, CONJUGATE_GRADIENTS)
 # What an iteration costs in units of one sparse product in single precision (benchmarks/radiosity.py prints them).
-RELATIVE_COSTS: Mapping[str, float] = {JACOBI: 1.0, GAUSS_SEIDEL: 5.0, BICGSTAB: 4.5}
+RELATIVE_COSTS: Mapping[str, float] = {JACOBI: 1.0, GAUSS_SEIDEL: 1.0, BICGSTAB: 2.1}
 # Preparing Gauss-Seidel (a triangular factor for each channel) and the Krylov methods (double precision), likewise.
-PREPARATION: Mapping[str, float] = {GAUSS_SEIDEL: 60.0, BICGSTAB: 6.0}
+PREPARATION: Mapping[str, float] = {GAUSS_SEIDEL: 20.0, BICGSTAB: 8.0}
 MOST_ITERATIONS = 5000
 # Predicted Jacobi iterations up to which no better method is looked for: finding one would cost as much.
 FEW_ITERATIONS = 10
