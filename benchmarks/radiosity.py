@@ -131,8 +131,8 @@ def on_gpu(matrix: sparse.csr_matrix, albedo: NDArray[np.float32], emittance: ND
     """Seconds per iteration in the compute shader."""
     from prt.gpu_shaders.radiosity import BATCH, RadiosityOnGpu
     solver = RadiosityOnGpu(matrix)
-    solver.solve(albedo, emittance, 1e-30, most=BATCH)
-    found = solver.solve(albedo, emittance, 1e-30, most=3 * BATCH)
+    solver.solve(albedo, emittance, tolerance=1e-30, most=BATCH)
+    found = solver.solve(albedo, emittance, tolerance=1e-30, most=3 * BATCH)
     return (found.seconds[-1] - found.seconds[0]) / (2 * BATCH)
 
 

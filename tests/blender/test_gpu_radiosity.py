@@ -33,7 +33,7 @@ def test_the_gpu_iterates_as_the_cpu_does(problem):
 
     matrix, albedo, emittance = problem
     on_gpu = RadiosityOnGpu(matrix)
-    found = on_gpu.solve(albedo, emittance, 1.0, most=BATCH)
+    found = on_gpu.solve(albedo, emittance, tolerance=1.0, most=BATCH)
     expected = solve_radiosity(matrix, albedo, emittance, JACOBI, 1e-30, most=BATCH)
     assert found.iterations == expected.iterations == BATCH
     assert np.abs(found.radiosity / expected.radiosity - 1.0).max() < 2e-6
@@ -46,10 +46,10 @@ def test_the_gpu_finds_the_exact_solution(problem):
 
     matrix, albedo, emittance = problem
     exact = solve_radiosity(matrix, albedo.astype(float), emittance.astype(float), BICGSTAB, 1e-12).radiosity
-    found = RadiosityOnGpu(matrix).solve(albedo, emittance, 1e-6)
+    found = RadiosityOnGpu(matrix).solve(albedo, emittance, tolerance=1e-6)
     assert found.residual <= 1e-6
     assert np.abs(found.radiosity / exact - 1.0).max() < 1e-5
-    near = RadiosityOnGpu(matrix).solve(albedo, emittance, 1e-6, start=found.radiosity)
+    near = RadiosityOnGpu(matrix).solve(albedo, emittance, found.radiosity, 1e-6)
     assert near.iterations < found.iterations
 
 
