@@ -73,11 +73,13 @@ class _Set:
 
 @dataclass
 class LiveMaterials:
-    """All sets of one scene. `edited`: what to draw in place of the baked object, by name; message: for the panel."""
+    """All sets of one scene. `edited`: what to draw in place of the baked object, by name; message: for the panel;
+    seconds: that the last answer took; answers: so far."""
 
     edited: dict[str, Edited] = field(default_factory=dict)
     message: str = ""
     seconds: float = 0.0
+    answers: int = 0
     _sets: dict[str, _Set] = field(default_factory=dict)
     _solver: str = ""
 
@@ -186,7 +188,7 @@ class LiveMaterials:
             if name in shown:
                 mine = added[start:start + len(shown[name].baked.positions)]
                 self._keep(name, shown[name], mine, surfaces.get(name), before.get(name), found.versions)
-        self.seconds = time.perf_counter() - started
+        self.seconds, self.answers = time.perf_counter() - started, self.answers + 1
         self.message = (f"Bounced light follows materials: {solution.method}, {solution.iterations} iterations, "
                         f"{self.seconds * 1e3:.0f} ms{self._solver}")
 
