@@ -84,7 +84,8 @@ def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: 
     lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
     centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
     mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings, selected), settings.spacing,
-                              np.concatenate([lamps, centres]) if settings.local_light else None)
+                              np.concatenate([lamps, centres]) if settings.local_light else None,
+                              split_slots=settings.live_editing)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 
@@ -171,7 +172,8 @@ class BakeSession:
         names = [o.name for o in scene.objects if o.is_target]
         targets_found = find_objects(names, depsgraph.scene)
         _check_storable(targets_found)
-        digests = {name: fingerprint(found, depsgraph) for name, found in zip(names, targets_found, strict=True)}
+        digests = {name: fingerprint(found, depsgraph, settings.live_editing)
+                   for name, found in zip(names, targets_found, strict=True)}
         geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
         folder = jobs_folder()
         _drop_forgotten(folder)
@@ -194,7 +196,7 @@ class BakeSession:
         """An interrupted bake whose result is there, if the scene is as it was when it was read; else None."""
         found = {o.name_full: o for o in depsgraph.scene.objects}
         if not jobs.job_summary(folder)["complete"] or surroundings(depsgraph) != record.surroundings or any(
-                name not in found or fingerprint(found[name], depsgraph) != digest
+                name not in found or fingerprint(found[name], depsgraph, "live_materials" in digest) != digest
                 for name, digest in record.digests.items()):
             return None
         claim = Claim.take(folder)

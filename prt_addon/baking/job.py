@@ -24,6 +24,7 @@ from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_clo
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from ..transport.live_operator import LiveOperator
 from .claims import Claim
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
@@ -35,6 +36,7 @@ _SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material"
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
 _CONTAINER_EXTRA = ("tangents", "source", "error")  # None where there are none
 _LAMP_ARRAYS = ("material", "kernels")  # of lamp_surfaces
+_LIVE_ARRAYS = ("counts", "indices", "values", "surfaces")  # of live
 
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
@@ -134,6 +136,8 @@ def run_job(folder: Path) -> Generator[Progress]:
         result.objects.values()) if container.cloud is not None}
     arrays |= {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
                for name in _LAMP_ARRAYS if container.lamp_surfaces is not None}
+    arrays |= {f"{index}_live_{name}": value for index, container in enumerate(result.objects.values())
+               if container.live is not None for name, value in container.live.arrays().items()}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -149,7 +153,9 @@ def read_result(folder: Path) -> BakeResult:
         cloud = read_cloud(check_header(header, name), arrays.get(f"{index}_cloud"), name)
         lamps = read_lamp_surfaces(header, *(arrays.get(f"{index}_{part}") for part in _LAMP_ARRAYS), len(parts[0]),
                                    name, REBAKE)
-        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps)
+        live = LiveOperator.of_arrays({part: arrays[f"{index}_live_{part}"] for part in _LIVE_ARRAYS}) \
+            if f"{index}_live_counts" in arrays else None
+        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps, live=live)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

@@ -57,6 +57,7 @@ from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
 from .lit_highlights import LitHighlights
+from .live_editing import kept_factors, with_live_editing
 from .local_budget import local_budget
 from .local_highlight_budget import local_highlight_budget
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
@@ -192,6 +193,7 @@ class _Bake:
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
+        self.kept_factors = kept_factors(gathered, self.albedo, self.basis.white(transfer), self.settings)
         glossy, subsurface = None, []
         if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
@@ -819,6 +821,8 @@ class _Bake:
         if self.local is not None:
             objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
                        for target in self.targets}
+        objects, report["live_editing"] = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces,
+                                                            self.albedo, self.buried)
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:

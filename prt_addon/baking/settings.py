@@ -80,6 +80,9 @@ class BakeSettings:
     merged_response: "arithmetic" = the mean of the merged lights' responses: what a response that is linear in position
         would be at their mean place; "harmonic" = as published (4.1), which is darker; "solution" = a new solution at
         the merged place, which costs as much again as the cloud, once for every zone.
+    live_editing: whether the bake keeps its form factors, so that bounced light in the preview follows base colours and
+        emission that are edited later. Costs 8 bytes per receiver and entry.
+    live_entries: most form factors kept per receiver; fewer cost less data and time, and make edits less exact.
     threads: 0 = one per core. seed: of all random choices.
     """
 
@@ -119,6 +122,8 @@ class BakeSettings:
     merge_distance: float = 0.5
     merge_response: float = 0.05
     merged_response: str = "arithmetic"
+    live_editing: bool = False
+    live_entries: int = 96
     threads: int = 0
     seed: int = 1
 
@@ -180,6 +185,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "zone_receivers": (0, 2 ** 31 - 1, "0 means one zone"),
     "merge_distance": (0.0, 1e6, "it is a fraction of the scene"),
     "merge_response": (0.0, 1e6, "it is a fraction of the brightest response"),
+    "live_entries": (8, 1024, "eight see too little, and few rows are longer"),
     "threads": (0, 1024, "0 means one per core"),
     "seed": (0, 2 ** 31 - 1, "a non-negative number"),
 }

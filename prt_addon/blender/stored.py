@@ -26,6 +26,7 @@ from ..storage.container import BakedTransfer
 from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
 from .bake_set import changed_piece
 from .fingerprint import RECEIVER_PROPERTY, fingerprint, geometry_digest, materials_as_baked, shows_relit
+from .live_materials import clear_live, write_live
 from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
 NORMAL_ATTRIBUTE, TANGENT_ATTRIBUTE = "prt_normal", "prt_tangent"
@@ -172,13 +173,15 @@ def transform_since_bake(scene_object: bpy.types.Object, header: dict,
 
 
 def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
-          surroundings: dict[str, str] | None = None, matrix: NDArray[np.float64] | None = None) -> str | None:
+          surroundings: dict[str, str] | None = None, matrix: NDArray[np.float64] | None = None,
+          follow: bool = False) -> str | None:
     """Why an object's bake no longer fits the scene, as a clause for the user; None while it does or without a bake.
 
     A bake fits as long as everything keeps its place relative to everything else (`transform_since_bake` tells where it
     went). surroundings: of now, from `fingerprint.surroundings`, if what else moved shall count too; without them a
-    move of the object alone makes it stale. matrix: as for `transform_since_bake`. Raises StorageError where the header
-    can't be read.
+    move of the object alone makes it stale. matrix: as for `transform_since_bake`. follow: edits of materials that live
+    editing follows count as none, for whoever shows what it finds (surroundings then likewise). Raises StorageError
+    where the header can't be read.
     """
     header = stored_header(scene_object)
     if header is None:
@@ -189,7 +192,7 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     geometry = [geometry_digest(scene_object, depsgraph, shown) for shown in images]
     if geometry[0] is not None and digests.get("geometry") not in geometry:
         return "its mesh or modifiers changed since the bake"
-    if digests.get("materials") != materials_as_baked(scene_object):
+    if digests.get("materials") != materials_as_baked(scene_object, follow):
         return "its materials changed since the bake"
     moved, then = transform_since_bake(scene_object, header, matrix), digests.get("surroundings")
     stays = np.array_equal(moved, np.eye(4))
@@ -304,6 +307,7 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
     if baked.lamp_surfaces is not None:
         _write_attribute(mesh, container.MATERIAL_ATTRIBUTE, "INT", baked.material)
         mesh[container.KERNELS_PROPERTY] = np.ascontiguousarray(baked.kernels, np.float32).ravel()
+    write_live(mesh, baked.live)
     if baked.error is not None:
         _write_attribute(mesh, container.ERROR_ATTRIBUTE, "FLOAT", baked.error)
     if baked.source is not None and not header["source"]["on_source_mesh"]:
@@ -379,6 +383,7 @@ def _clear_mesh(mesh: bpy.types.Mesh) -> None:
                 container.KERNELS_PROPERTY):
         if key in mesh:
             del mesh[key]
+    clear_live(mesh)
     if active in mesh.color_attributes:
         mesh.color_attributes.active_color_name = active
     if default in mesh.color_attributes:

@@ -16,6 +16,7 @@ from ..errors import StorageError
 from ..lighting.light_cloud import LightCloud
 from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..relighting.lamp_highlights import LampSurfaces
+from ..transport.live_operator import LiveOperator
 from .columns import LIT_SURFACES, Columns, cloud_part, cubemap_size, read_columns
 from .lamp_surfaces import read_lamp_surfaces
 
@@ -32,6 +33,7 @@ MATERIAL_ATTRIBUTE = "prt_material"
 ERROR_ATTRIBUTE = "prt_error"
 SOURCE_ATTRIBUTE = "prt_source"
 KERNELS_PROPERTY = "prt_kernels"
+LIVE_ENTRY = "live_editing"  # in headers: which form factors, and where its rows begin; also a setting's name
 REBAKE = "Bake the object again"
 CONSTANT_ROWS: dict[str, Any] = {"kind": "constant"}
 HEMISPHERE_KIND = "constant_and_hemisphere"
@@ -56,6 +58,7 @@ class BakedTransfer:
     lamp_surfaces: what materials do to the direct light of lamps, where there are a cloud and view-dependent rows.
     source: (t,) int32, which of the source mesh's triangles each one is or is a part of; None in bakes that did not
     keep it. error: (p,) float32, how far off M_p is, relative to the RMS of the object's transfer; None likewise.
+    live: the form factors of the whole bake, on one of its objects, where it keeps them for edits of materials.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
     x tangent, y normal x tangent, z normal.
@@ -74,6 +77,7 @@ class BakedTransfer:
     lamp_surfaces: LampSurfaces | None = None
     source: NDArray[np.int32] | None = None
     error: NDArray[np.float32] | None = None
+    live: LiveOperator | None = None
 
     @property
     def material(self) -> NDArray[np.int32] | None:
