@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from ray_measurements import (
     MODEL_HEADER,
+    RATES_HEADER,
     SWEEP_HEADER,
     Agreement,
     Embree,
@@ -45,7 +46,11 @@ class ModernglDevice:
     """A RayDevice over moderngl."""
 
     def __init__(self, kernels: Path) -> None:
-        self.context = moderngl.create_context(standalone=True, backend="egl", require=430)
+        try:
+            self.context = moderngl.create_context(standalone=True, backend="egl", require=430, libgl="libGL.so.1",
+                                                   libegl="libEGL.so.1")
+        except Exception:
+            self.context = moderngl.create_context(standalone=True, backend="egl", require=430)
         self.name = self.context.info["GL_RENDERER"]
         self.version = self.context.info["GL_VERSION"]
         self._programs: dict[tuple[str, bool], tuple[Any, list[str]]] = {}
@@ -143,8 +148,7 @@ def main() -> None:
 
     results["rates"] = [row for scene in scenes for row in rates(scene, engines[scene.name], embrees[scene.name],
                                                                  arguments.rate_rays)]
-    print_table("Rays per second, traversal, transfers included", ["scene", "rays", "query", "GPU Mray/s",
-                "Embree Mray/s", "factor"], results["rates"])
+    print_table("Rays per second, traversal", RATES_HEADER, results["rates"])
     print(f"at {time.perf_counter() - began:.0f} s")
 
     if embrees[scenes[0].name]:

@@ -24,6 +24,7 @@ import numpy as np
 from common import ROOT, print_table
 from ray_measurements import (
     MODEL_HEADER,
+    RATES_HEADER,
     SWEEP_HEADER,
     Agreement,
     Embree,
@@ -94,7 +95,7 @@ def main() -> None:
     engines = {name: RayEngine(device, scene.points, scene.triangles) for name, scene in made.items()}
     embrees = {name: Embree(scene.points, scene.triangles, arguments.threads) for name, scene in made.items()}
     print()
-    print_table(["scene", "rays", "query", "GPU Mray/s", "Embree Mray/s", "factor"],
+    print_table(RATES_HEADER,
                 [row for name, scene in made.items() for row in rates(scene, engines[name], embrees[name],
                                                                       arguments.rate_rays)])
     print()

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from prt_addon.tracing.hits import Hits
 from prt_addon.tracing.ray_buckets import make_buckets, pair_with_cells
-from prt_addon.tracing.ray_calibration import all_pairs_run
-from prt_addon.tracing.ray_cost import NEAREST_BYTES, Calibration, gpu_share
-from prt_addon.tracing.ray_engine import FARTHEST, RayEngine
+from prt_addon.tracing.ray_calibration import all_pairs_run, traversal_seconds
+from prt_addon.tracing.ray_cost import Calibration, gpu_share
+from prt_addon.tracing.ray_engine import FARTHEST, MOST_RAYS, RayEngine
 
 # Distances that agree so far are the same place; weights of corners below this lie on an edge; smaller cosines graze.
 SAME_PLACE, ON_EDGE, GRAZING = 2e-6, 2e-5, 2e-3
@@ -177,7 +177,7 @@ def agreement(scene: Scene, engine: RayEngine, embree: Embree, count: int, secon
 
 
 def rates(scene: Scene, engine: RayEngine, embree: Embree | None, count: int) -> list[list[Any]]:
-    """Rows (scene, rays, query, GPU Mray/s, Embree Mray/s, factor)."""
+    """Rows as RATES_HEADER says; the kernel alone with the first batch of rays."""
     rows = []
     for kind, query in (("parallel", "occluded"), ("parallel", "nearest"), ("gather", "occluded"),
                         ("gather", "nearest")):
@@ -187,8 +187,14 @@ def rates(scene: Scene, engine: RayEngine, embree: Embree | None, count: int) ->
         cpu = np.nan
         if embree is not None:
             cpu = rays / best_seconds(lambda q=query, b=batches: [getattr(embree, q)(*batch) for batch in b])
-        rows.append([scene.name, kind, query, gpu / 1e6, cpu / 1e6, gpu / cpu])
+        origins, directions = batches[0][0][:MOST_RAYS // 8], batches[0][1][:MOST_RAYS // 8]
+        alone = len(origins) / traversal_seconds(engine, origins, directions, query == "occluded")
+        rows.append([scene.name, kind, query, alone / 1e6, gpu / 1e6, cpu / 1e6, gpu / cpu])
     return rows
+
+
+RATES_HEADER = ["scene", "rays", "query", "GPU kernel alone, Mray/s", "GPU with transfers, Mray/s", "Embree Mray/s",
+                "factor with transfers"]
 
 
 def best_seconds(work: Callable[[], Any], runs: int = 2) -> float:
@@ -265,8 +271,3 @@ def sweep(scene: Scene, engine: RayEngine, known: Calibration, kind: str, count:
 SWEEP_HEADER = ["scene", "rays", "R", "T", "cells per bucket", "triangles per ray (all pairs)", "CPU pairing s",
                 "eq. 11 s (no early end)", "GPU s", "Mray/s, pairing included", "Mray/s, GPU part",
                 "% of buckets for the GPU"]
-
-
-def bytes_per_ray() -> float:
-    """gamma of nearest hits."""
-    return NEAREST_BYTES

@@ -32,7 +32,7 @@ def calibrate(device: RayDevice, embree: Callable[[NDArray, NDArray, NDArray], C
     engine.occluded(origins[:GROUP], directions[:1])  # compiles
     engine.nearest(origins[:GROUP], directions[:1])
     latency, readback, upload = transfers(device)
-    traversal = RAYS / _steady(lambda count: _traversal_seconds(engine, origins, directions[:1], count), RAYS)
+    traversal = RAYS / _steady(lambda count: traversal_seconds(engine, origins[:count], directions[:1], True), RAYS)
     fill = 1.0 / seconds_per_test(engine)
     occluded = _rate(lambda k: engine.occluded(origins, directions[k:k + 1]))
     nearest = _rate(lambda k: engine.nearest(origins, directions[k:k + 1]))
@@ -119,16 +119,18 @@ def all_pairs_run(engine: RayEngine, rays: int, triangles: int, bucket_rays: int
     return lambda: device.run(CELLS, False, textures, answers, constants, -(-rays // GROUP)), answers
 
 
-def _traversal_seconds(engine: RayEngine, origins: NDArray[np.float32], direction: NDArray[np.float32],
-                       count: int) -> float:
-    device, count = engine.device, max(GROUP, min(count, len(origins)))
-    textures = {"ray_origins": device.upload(ray_texels(origins[:count], FARTHEST)),
-                "ray_directions": device.upload(ray_texels(direction, np.float32(0.0))),
+def traversal_seconds(engine: RayEngine, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                      occluded: bool) -> float:
+    """Seconds of the kernel that walks the tree alone, rays and answers staying on the device; in one dispatch."""
+    device = engine.device
+    textures = {"ray_origins": device.upload(ray_texels(origins, FARTHEST)),
+                "ray_directions": device.upload(ray_texels(directions, np.float32(0.0))),
                 "node_values": engine.node_texture, "triangle_values": engine.triangle_texture}
-    groups = -(-count // GROUP)
-    answers = device.empty(WIDTH, -(-groups // WIDTH))
-    return _kernel_seconds(device, lambda: device.run(TRAVERSAL, True, textures, answers,
-                                                      {"rays": count, "direction_step": 0}, groups), answers)
+    groups = -(-len(origins) // GROUP)
+    answers = device.empty(WIDTH, -(-(groups if occluded else groups * GROUP) // WIDTH))
+    constants = {"rays": len(origins), "direction_step": int(len(directions) > 1)}
+    return _kernel_seconds(device, lambda: device.run(TRAVERSAL, occluded, textures, answers, constants, groups),
+                           answers)
 
 
 def _kernel_seconds(device: RayDevice, run: Callable[[], None], answers: Any) -> float:

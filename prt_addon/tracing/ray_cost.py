@@ -77,10 +77,17 @@ class Calibration:
 
 @dataclass(frozen=True)
 class TracerChoice:
-    """gpu: whether the GPU takes part; why: in words, with the measured numbers."""
+    """gpu: whether the GPU takes part; who, reason: in words, with the measured numbers; measured: whether there are."""
 
     gpu: bool
-    why: str
+    who: str
+    reason: str
+    measured: bool = True
+
+    @property
+    def why(self) -> str:
+        """Both in one line."""
+        return f"{self.who}: {self.reason}"
 
 
 def choose_tracer(calibration: Calibration | None, threads: int) -> TracerChoice:
@@ -89,13 +96,13 @@ def choose_tracer(calibration: Calibration | None, threads: int) -> TracerChoice
     threads: that the bake will use; Embree's rate is scaled to them.
     """
     if calibration is None:
-        return TracerChoice(False, "Embree: the GPU's speed at tracing was not measured on this computer")
+        return TracerChoice(False, "Embree", "the GPU's speed at tracing was not measured on this computer", False)
     embree = calibration.embree_rays * threads / calibration.threads
     gpu = calibration.occluded_rays
-    rates = (f"{mega(embree)} here, the GPU {mega(gpu)} ({calibration.device})")
+    rates = f"{mega(embree)} here, the GPU {mega(gpu)} ({calibration.device})"  # read after "Embree has"
     if gpu < LEAST_GAIN * embree:
-        return TracerChoice(False, f"Embree: {rates}, left out")
-    return TracerChoice(True, f"GPU and Embree side by side: Embree {rates}")
+        return TracerChoice(False, "Embree", f"Embree has {rates}")
+    return TracerChoice(True, "the GPU beside Embree", f"Embree has {rates}")
 
 
 def mega(rays: float) -> str:

@@ -40,6 +40,11 @@ class Tracer:
                                       range(os.cpu_count() or 1))
         self.rays = 0
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Who traced, for the report."""
+        return {"name": "Embree", "threads": self.threads}
+
     def to_tracing_space(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """World positions (n, 3) as Embree sees them."""
         return np.ascontiguousarray((points - self._centre) / self.diagonal, np.float32)
