@@ -46,6 +46,7 @@ def part(name: str) -> types.ModuleType:
 
 def make_device() -> Any:
     """The graphics driver, ready to compute. It ends the process where there is none, which the parent reports."""
+    import bpy  # noqa: F401  in a plain Python it is what brings the module below
     import gpu
 
     gpu.init()

@@ -53,7 +53,7 @@ def tracing_choice(threads: int = 0) -> TracerChoice:
 def left_out(threads: int = 0) -> list[dict[str, str]]:
     """The GPU as an entry of a report's left-out list, if it was measured and is left out, with its numbers."""
     choice = tracing_choice(threads)
-    return [{"what": WHAT, "why": choice.reason, "saved": SAVED}] if choice.measured and not choice.gpu else []
+    return [{"what": WHAT, "why": choice.left_out, "saved": SAVED}] if choice.left_out else []
 
 
 def bake_process(claim: Claim, threads: int) -> BakeProcess:

@@ -77,17 +77,12 @@ class Calibration:
 
 @dataclass(frozen=True)
 class TracerChoice:
-    """gpu: whether the GPU takes part; who, reason: in words, with the measured numbers; measured: whether there are."""
+    """gpu: whether the GPU takes part; why: in words; left_out: why it is left out, with numbers, "" where it takes
+    part or was never measured."""
 
     gpu: bool
-    who: str
-    reason: str
-    measured: bool = True
-
-    @property
-    def why(self) -> str:
-        """Both in one line."""
-        return f"{self.who}: {self.reason}"
+    why: str
+    left_out: str = ""
 
 
 def choose_tracer(calibration: Calibration | None, threads: int) -> TracerChoice:
@@ -96,13 +91,13 @@ def choose_tracer(calibration: Calibration | None, threads: int) -> TracerChoice
     threads: that the bake will use; Embree's rate is scaled to them.
     """
     if calibration is None:
-        return TracerChoice(False, "Embree", "the GPU's speed at tracing was not measured on this computer", False)
+        return TracerChoice(False, "Embree: the GPU's speed at tracing was not measured on this computer")
     embree = calibration.embree_rays * threads / calibration.threads
-    gpu = calibration.occluded_rays
-    rates = f"{mega(embree)} here, the GPU {mega(gpu)} ({calibration.device})"  # read after "Embree has"
+    gpu, device = calibration.occluded_rays, calibration.device
     if gpu < LEAST_GAIN * embree:
-        return TracerChoice(False, "Embree", f"Embree has {rates}")
-    return TracerChoice(True, "the GPU beside Embree", f"Embree has {rates}")
+        return TracerChoice(False, f"Embree: {mega(embree)} here, the GPU {mega(gpu)} ({device}), left out",
+                            f"it traces {mega(gpu)} here ({device}) and Embree {mega(embree)}")
+    return TracerChoice(True, f"the GPU beside Embree: {mega(gpu)} ({device}), Embree {mega(embree)}")
 
 
 def mega(rays: float) -> str:
