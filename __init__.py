@@ -24,6 +24,7 @@ from .operators.export import PRT_OT_export
 from .operators.interrupted import PRT_OT_discard_interrupted, PRT_OT_resume
 from .operators.job_mixin import JobMixin
 from .operators.keyframe_light import PRT_OT_keyframe_light
+from .operators.measure_tracing import PRT_OT_measure_tracing
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
 from .operators.report import PRT_OT_show_report, PRT_OT_write_report
@@ -56,6 +57,7 @@ CLASSES = (
     PRT_OT_keyframe_light,
     PRT_OT_draw_camera,
     PRT_OT_compare,
+    PRT_OT_measure_tracing,
     PRT_OT_export,
     PRT_OT_write_report,
     PRT_OT_show_report,

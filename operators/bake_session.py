@@ -8,7 +8,6 @@ is complete. Whatever ends a bake earlier leaves previous bakes as they are and 
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -45,6 +44,7 @@ from ..prt_addon.reporting.headline import PARTS, headline
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from .place import Place
+from .tracing_choice import bake_process, left_out, tracing_choice
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 KEPT_DAYS = 14
@@ -93,7 +93,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   targets: Sequence[str] | None) -> dict[str, Any]:
     """What a bake of the scene would need, leave out and cost, as JSON-able values."""
     scene = read_scene(depsgraph, settings, targets)
-    settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
+    settings, lost = fit_to_lamps(settings, read_local_lights(depsgraph, []))
     light = reference_light(depsgraph)
     # In Blender's own process nothing starts threads (design/architecture.md).
     settings, choice = choose_basis(scene, settings, light, threads=1)
@@ -113,9 +113,10 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   "channels": plan.needs.channels, **(basis.facts if basis else {})},
         "basis": basis.words if basis else "",
         "choice": None if choice is None else choice.facts,
-        "left_out": [asdict(item) for item in plan.needs.left_out],
+        "left_out": [*(asdict(item) for item in plan.needs.left_out), *left_out(settings.threads)],
+        "tracer": tracing_choice(settings.threads).why,
         "hints": list(plan.needs.hints),
-        "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *left_out],
+        "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *lost],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
         "rays": sum(plan.rays.values()),
@@ -167,8 +168,8 @@ class BakeSession:
         if selected is None:
             selected = selected_names(depsgraph.view_layer)
         scene = read_scene(depsgraph, settings, targets, selected)
-        settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
-        scene = replace(scene, warnings=(*scene.warnings, *left_out))
+        settings, lost = fit_to_lamps(settings, read_local_lights(depsgraph, []))
+        scene = replace(scene, warnings=(*scene.warnings, *lost))
         names = [o.name for o in scene.objects if o.is_target]
         targets_found = find_objects(names, depsgraph.scene)
         _check_storable(targets_found)
@@ -184,7 +185,7 @@ class BakeSession:
             write_record(claim.folder, JobRecord(
                 bpy.data.filepath, place.scene, place.view_layer, tuple(names), _tuple(targets), tuple(selected),
                 asked.as_dict(), digests, around, os.getpid(), time.time()))
-            process = BakeProcess([sys.executable, *bpy.app.python_args], claim.folder)
+            process = bake_process(claim, settings.threads)
             process.start()
         except BaseException:
             claim.release()
@@ -224,6 +225,7 @@ class BakeSession:
         is lost if the file can't be saved.
         """
         result = jobs.read_result(self.job)
+        result.report["left_out"] += left_out(int(result.report["settings"]["threads"]))
         found = self.targets()
         gone = [name for name, target in found.items() if target is None]
         if len(gone) == len(found):

@@ -45,6 +45,7 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
             distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")
+        self.layout.operator("prt.measure_tracing", icon="SORTTIME")
 
 
 class PRT_PT_highlights(_Expert, bpy.types.Panel):

@@ -7,7 +7,7 @@ afresh. Where another living process bakes the same job, the folder has a number
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
@@ -24,6 +24,7 @@ from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_clo
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from ..tracing.tracer import Tracer
 from ..transport.live_operator import LiveOperator
 from .claims import Claim
 from .recipe import BakeResult, Progress, bake
@@ -124,12 +125,12 @@ def _material(entry: dict[str, Any]) -> SurfaceMaterial:
                               for name, value in entry.items()})
 
 
-def run_job(folder: Path) -> Generator[Progress]:
-    """Bake a job, resuming after its finished stages, and leave the result in its folder."""
+def run_job(folder: Path, make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress]:
+    """Bake a job, resuming after its finished stages, and leave the result in its folder. make_tracer: see `bake`."""
     if intact(folder / RESULT_FILE) is not None:
         return
     scene, settings, light, digests, regions = read_job(folder)
-    result = yield from bake(scene, settings, folder, light, digests, regions)
+    result = yield from bake(scene, settings, folder, light, digests, regions, make_tracer)
     arrays = {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
               for name in _CONTAINER_ARRAYS + _CONTAINER_EXTRA if getattr(container, name) is not None}
     arrays |= {f"{index}_cloud": flatten_cloud(container.cloud) for index, container in enumerate(

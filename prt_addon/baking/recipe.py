@@ -8,7 +8,7 @@ later run of the same job starts after the last one.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
 from dataclasses import dataclass, field, fields, replace
@@ -118,17 +118,19 @@ Steps = Generator[Progress, None, Any]
 
 def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
          light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
-         regions: NDArray[np.float64] | None = None) -> Generator[Progress, None, BakeResult]:
+         regions: NDArray[np.float64] | None = None,
+         make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress, None, BakeResult]:
     """Yield progress and return the result.
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
-    scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    scene's free space). make_tracer: of points, triangles and a number of threads. Raises PRTError for what a user can
+    mend; leaves only whole files in job_folder.
     """
     settings, choice = choose_basis(scene, settings, light)
     settings = transport_settings(settings)
     regions = np.empty((0, 4, 4)) if regions is None else regions
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice).run())
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice, make_tracer).run())
 
 
 def transport_settings(settings: BakeSettings) -> BakeSettings:
@@ -152,6 +154,7 @@ class _Bake:
     digests: dict[str, str]
     regions: NDArray[np.float64]
     choice: BasisChoice | None = None
+    make_tracer: Callable[..., Tracer] = Tracer
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
@@ -294,7 +297,7 @@ class _Bake:
 
     def _prepare(self) -> None:
         settings = self.settings
-        self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
+        self.tracer = self.make_tracer(self.scene.points, self.scene.triangles, settings.threads)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
@@ -794,6 +797,7 @@ class _Bake:
                            time.perf_counter() - self.started)
         report["basis"] = self.basis.words if self.settings.distant_light else ""
         report["choice"] = None if self.choice is None else self.choice.facts
+        report["tracer"] = self.tracer.facts
         if self.local is not None:
             report["local"] = self.local.facts
             report["local_errors"] = self.local_errors

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,21 +19,9 @@ from numpy.typing import NDArray
 
 from ..errors import PRTError
 from ..scene.object_mesh import bounding_diagonal
+from .hits import Hits
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Hits:
-    """Nearest hits of n rays. triangle: (n,) int32, -1 for a miss; u, v: barycentric weights of corners 1 and 2;
-    front: (n,) bool, the ray met the side that the triangle winds counter-clockwise on; distance: (n,) in tracing space
-    (of world space, divided by the scene's diagonal)."""
-
-    triangle: NDArray[np.int32]
-    u: NDArray[np.float32]
-    v: NDArray[np.float32]
-    front: NDArray[np.bool_]
-    distance: NDArray[np.float32]
 
 
 class Tracer:
@@ -52,6 +39,11 @@ class Tracer:
         self.threads = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else
                                       range(os.cpu_count() or 1))
         self.rays = 0
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Who traced, for the report."""
+        return {"name": "Embree", "threads": self.threads}
 
     def to_tracing_space(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """World positions (n, 3) as Embree sees them."""
