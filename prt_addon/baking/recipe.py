@@ -280,7 +280,7 @@ class _Bake:
 
     def _prepare(self) -> None:
         settings = self.settings
-        self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
+        self.tracer = Tracer.of_scene(self.scene, settings.threads)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))

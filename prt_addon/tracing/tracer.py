@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from ..errors import PRTError
 from ..scene.object_mesh import bounding_diagonal
+from ..scene.scene_mesh import SceneMesh
+from ..scene.texel_surface import TracedSurface
 
 Result = TypeVar("Result")
 
@@ -35,6 +37,7 @@ class Hits:
     v: NDArray[np.float32]
     front: NDArray[np.bool_]
     distance: NDArray[np.float32]
+    traced: tuple[NDArray, NDArray, NDArray] | None = None  # triangle, u, v on the true surface under texels
 
 
 class Tracer:
@@ -44,7 +47,8 @@ class Tracer:
     core that this process may use). `rays` counts every ray traced.
     """
 
-    def __init__(self, points: NDArray[np.float64], triangles: NDArray[np.int32], threads: int = 0) -> None:
+    def __init__(self, points: NDArray[np.float64], triangles: NDArray[np.int32], threads: int = 0,
+                 surface: TracedSurface | None = None) -> None:
         used = points[np.unique(triangles)] if len(triangles) else points
         self.diagonal = bounding_diagonal([used]) or 1.0
         self._centre = 0.5 * (used.min(axis=0) + used.max(axis=0)) if len(used) else np.zeros(3)
@@ -52,6 +56,12 @@ class Tracer:
         self.threads = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else
                                       range(os.cpu_count() or 1))
         self.rays = 0
+        self.surface = surface
+
+    @staticmethod
+    def of_scene(scene: SceneMesh, threads: int = 0) -> Tracer:
+        """Over a scene's true surface; hits are named by the scene's own triangles, which join its points."""
+        return Tracer(*scene.shape, threads, scene.traced)
 
     def to_tracing_space(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """World positions (n, 3) as Embree sees them."""
@@ -74,7 +84,10 @@ class Tracer:
         found = self._scene.run(origins, directions, query="INTERSECT", output=1)
         # Embree's geometric normal follows the winding, so a ray against it meets the front.
         front = np.sum(found["Ng"] * directions, axis=1) < 0.0
-        return Hits(found["primID"], found["u"], found["v"], front, found["tfar"])
+        if self.surface is None:
+            return Hits(found["primID"], found["u"], found["v"], front, found["tfar"])
+        traced = found["primID"], found["u"], found["v"]
+        return Hits(*self.surface.named(*traced), front, found["tfar"], traced)
 
     def map_in_order(self, work: Callable[[Any], Result], items: Iterable[Any]) -> Iterator[tuple[Any, Result]]:
         """Run `work` on items in threads, yielding (item, result) in the items' order.
