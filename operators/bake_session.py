@@ -82,7 +82,7 @@ def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: 
     lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
     centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
     mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings, selected), settings.spacing,
-                              np.concatenate([lamps, centres]) if settings.local_light else None)
+                              np.concatenate([lamps, centres]) if settings.local_light else None, settings.texels)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 

@@ -309,10 +309,17 @@ def _join(objects: list[ObjectMesh], parts: list[_Part], materials: tuple[Surfac
     points, normals, albedo, material, tangents, source = (
         np.concatenate([getattr(p, name) for p in parts])
         for name in ("points", "normals", "albedo", "material", "tangents", "source"))
-    surfaces = tuple(part.surface for part in parts)
-    faces = None
-    if any(surfaces):
-        faces = np.concatenate([np.zeros((len(part.points), 3)) if part.surface is None else part.surface.faces
-                                for part in parts])
-    return SceneMesh(points, normals, joined, albedo, loose, material, tangents, tuple(scene_objects), materials,
-                     warnings, source, faces, surfaces if any(surfaces) else ())
+    scene = SceneMesh(points, normals, joined, albedo, loose, material, tangents, tuple(scene_objects), materials,
+                      warnings, source)
+    return with_surfaces(scene, tuple(part.surface for part in parts))
+
+
+def with_surfaces(scene: SceneMesh, surfaces: tuple[TexelSurface | None, ...]) -> SceneMesh:
+    """The scene, whose points are texels of these surfaces of its objects; itself where there are none."""
+    if not any(surfaces):
+        return scene
+    faces = np.zeros_like(scene.points)
+    for scene_object, surface in zip(scene.objects, surfaces, strict=True):
+        if surface is not None:
+            faces[scene_object.points] = surface.faces
+    return replace(scene, faces=faces, surfaces=surfaces)
