@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.errors import BadScene
+from ..prt_addon.relighting.texel_light import corner_albedo
 from . import hemisphere_glsl
 
 if TYPE_CHECKING:
@@ -180,9 +181,7 @@ def texel_data(baked: BakedTransfer, encoding: NDArray[np.float32], cluster_vect
     surface = baked.texels
     clusters, vectors_and_mean, rows, columns, _ = baked.bases.shape
     corner = surface.triangles.ravel()
-    triangle = np.repeat(np.arange(len(surface.triangles)), 3)
-    weights = np.tile(np.eye(3), (len(surface.triangles), 1))
-    albedo = surface.layout.sample(baked.albedo, triangle, weights[:, 1], weights[:, 2])
+    albedo = corner_albedo(baked).reshape(-1, 3)
     points, normals, tangents = (np.ascontiguousarray(values[corner], np.float32)
                                  for values in (surface.points, surface.normals, surface.tangents))
     return RenderData(
