@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Double = NDArray[np.float64]
+INWARD = 1e-3  # texels
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,12 @@ class AtlasCells:
         corners = self.places[triangle]
         at = corners[:, 0] + u[:, None] * (corners[:, 1] - corners[:, 0]) + v[:, None] * (corners[:, 2] - corners[:, 0])
         cell, part = self._found(at)
-        missing = cell < 0
-        if missing.any():  # on a rim, by rounding: a little towards the triangle's middle
-            cell[missing], part[missing] = self._found(at[missing] + 1e-3 * (corners[missing].mean(axis=1)
-                                                                             - at[missing]))
-            missing = np.flatnonzero(cell < 0)
-            cell[missing] = self.fallback[triangle[missing]]
+        missing = np.flatnonzero(cell < 0)
+        if len(missing):  # on a rim, by rounding: whose square lies a little towards the triangle's middle
+            inward = corners[missing].mean(axis=1) - at[missing]
+            inward *= INWARD / np.maximum(np.abs(inward).max(axis=1, keepdims=True), INWARD)
+            found, _ = self._found(at[missing] + inward)
+            cell[missing] = np.where(found < 0, self.fallback[triangle[missing]], found)
             key = self.cell_key[cell[missing]]
             part[missing] = np.clip(at[missing] - np.stack([key % self.width, key // self.width], axis=1), 0.0, 1.0)
         return cell, part
