@@ -85,7 +85,7 @@ def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: 
     centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
     mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings, selected), settings.spacing,
                               np.concatenate([lamps, centres]) if settings.local_light else None,
-                              split_slots=settings.live_editing)
+                              settings.texels, settings.live_editing)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 

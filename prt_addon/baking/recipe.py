@@ -124,8 +124,8 @@ def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = Non
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
-    scene's free space). make_tracer: of points, triangles and a number of threads. Raises PRTError for what a user can
-    mend; leaves only whole files in job_folder.
+    scene's free space). make_tracer: of points, triangles, a number of threads and the surface of texels (None:
+    none). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
     settings, choice = choose_basis(scene, settings, light)
     settings = transport_settings(settings)
@@ -297,7 +297,7 @@ class _Bake:
 
     def _prepare(self) -> None:
         settings = self.settings
-        self.tracer = self.make_tracer(self.scene.points, self.scene.triangles, settings.threads)
+        self.tracer = self.make_tracer(*self.scene.shape, settings.threads, self.scene.traced)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))

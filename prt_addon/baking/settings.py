@@ -9,6 +9,8 @@ from typing import Any
 from ..compression.eigentransport import MOST_VECTORS
 from ..compression.settings import METHODS
 from ..errors import BadArguments
+from ..scene.texel_receivers import RECEIVERS, TexelChoice
+from ..scene.unwrapping import METHODS as METHODS_OF_CHARTS
 
 HIGHEST_ORDER = 10
 GLOSSY_ROWS = (0, 4, 9, 16, 24, 25)
@@ -42,6 +44,11 @@ class BakeSettings:
         cluster (Sloan 2003, section 5; the paper spent 0.05 to 0.1). 0 = off, because drawing does not need it: each
         vertex blends its own cluster in one pass. It serves export and renderers that draw cluster by cluster.
     spacing: longest triangle edge as a fraction of the baked objects' diagonal; coarser triangles are refined; 0 = off.
+    receivers: "vertices", or "texels" of an atlas, spacing apart: on walls of few triangles, whose light then is as
+        fine as the atlas and not as the mesh, and is a picture for game engines; "auto" = texels on objects of coarse
+        triangles. atlas_size: most texels along a side of an object's atlas; with a spacing of 0 as many as fit.
+    atlas_charts: what lays surfaces flat: "projection", "xatlas" (fewer charts on curved surfaces; not in every Python,
+        and slow on meshes with errors) or "auto", which tries that first.
     rotation_group: receivers that share one random rotation of the directions; 0 = all share one set, unrotated.
     error_receivers, error_paths: receivers, and paths from each, of the reference that measures the error; 0 = none.
     glossy_rows: most functions of the view direction that a highlight gets (4, 9, 16, 24 or 25); 0 = none: only
@@ -97,6 +104,9 @@ class BakeSettings:
     compression_error: float = 2e-3
     coherence: float = 0.0
     spacing: float = 1.0 / 64.0
+    receivers: str = "vertices"
+    atlas_size: int = 512
+    atlas_charts: str = "projection"
     rotation_group: int = 0
     error_receivers: int = 64
     error_paths: int = 8192
@@ -137,6 +147,11 @@ class BakeSettings:
         """Whether lamps within a light cloud are baked."""
         return "local" in self.lighting.split(",")
 
+    @property
+    def texels(self) -> TexelChoice | None:
+        """Which objects get texels as receivers; None where none does."""
+        return None if self.receivers == "vertices" else TexelChoice(self.receivers, self.atlas_size, self.atlas_charts)
+
     def as_dict(self) -> dict[str, Any]:
         """All settings by name, as stored in report and header."""
         return asdict(self)
@@ -171,6 +186,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "compression_error": (0.0, 1.0, "it is relative"),
     "coherence": (0.0, 0.5, "the encoder's work would be undone"),
     "spacing": (0.0, 1.0, "it is a fraction of the diagonal"),
+    "atlas_size": (8, 4096, "an atlas of more does not fit every graphics card's memory"),
     "rotation_group": (0, 2 ** 20, "0 means one set for all"),
     "error_receivers": (0, 4096, "the reference is slow"),
     "error_paths": (64, 2 ** 20, "fewer say nothing"),
@@ -237,7 +253,8 @@ def check(settings: BakeSettings) -> BakeSettings:
         raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
                            f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
     for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES), ("lamp_basis", LAMP_BASES),
-                        ("distant_basis", DISTANT_BASES)):
+                        ("distant_basis", DISTANT_BASES), ("receivers", RECEIVERS),
+                        ("atlas_charts", METHODS_OF_CHARTS)):
         if getattr(settings, name) not in words:
             raise BadArguments(f"setting {name}", f"{getattr(settings, name)!r} is unknown",
                                f"Use one of {' or '.join(words)}")

@@ -21,9 +21,19 @@ from numpy.typing import NDArray
 from ..errors import StorageError
 from ..relighting.moved_light import similarity
 from ..scene.tangents import tangent_frame
+from ..scene.texel_surface import TexelSurface
 from ..storage import container
 from ..storage.container import BakedTransfer
 from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
+from ..storage.texels import (
+    ATLAS_PROPERTY,
+    TEXEL_ATTRIBUTE,
+    TRIANGLE_ATTRIBUTE,
+    flatten_surface,
+    read_texels,
+    texel_numbers,
+)
+from ..storage.texels import ENTRY as ATLAS
 from .bake_set import changed_piece
 from .fingerprint import RECEIVER_PROPERTY, fingerprint, geometry_digest, materials_as_baked, shows_relit
 from .live_materials import clear_live, write_live
@@ -35,7 +45,8 @@ RECEIVER_NAME = "PRT {}"
 MOVED = "it was moved, turned or scaled since the bake, and not all that is around it came along"
 MATRIX_TOLERANCE = 1e-5  # relative to the largest entry: rounding of parents and constraints, not a move
 OURS = (container.CLUSTER_ATTRIBUTE, container.WEIGHTS_ATTRIBUTE, container.ALBEDO_ATTRIBUTE, NORMAL_ATTRIBUTE,
-        TANGENT_ATTRIBUTE, container.MATERIAL_ATTRIBUTE, container.ERROR_ATTRIBUTE, container.SOURCE_ATTRIBUTE)
+        TANGENT_ATTRIBUTE, container.MATERIAL_ATTRIBUTE, container.ERROR_ATTRIBUTE, container.SOURCE_ATTRIBUTE,
+        TEXEL_ATTRIBUTE)
 
 
 def write_baked(scene_object: bpy.types.Object, baked: BakedTransfer, digests: dict[str, str | None] | None = None,
@@ -109,11 +120,13 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
         kernels = _read_numbers(mesh, container.KERNELS_PROPERTY) if container.KERNELS_PROPERTY in mesh else None
     baked = container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud, material,
                              kernels)
+    texels = _read_texels(mesh, header, triangles, scene_object.name)
     error = _read_optional(mesh, container.ERROR_ATTRIBUTE, "FLOAT", "POINT")
     source = _read_optional(mesh, container.SOURCE_ATTRIBUTE, "INT", "FACE")
     if source is None and header.get("source", {}).get("on_source_mesh"):
         source = np.arange(len(triangles), dtype=np.int32)
-    return replace(baked, error=error, source=source if source is None or len(source) == len(triangles) else None)
+    return replace(baked, error=error, texels=texels,
+                   source=source if source is None or len(source) == len(triangles) else None)
 
 
 def baked_mesh(scene_object: bpy.types.Object) -> bpy.types.Mesh | None:
@@ -312,6 +325,10 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
         _write_attribute(mesh, container.ERROR_ATTRIBUTE, "FLOAT", baked.error)
     if baked.source is not None and not header["source"]["on_source_mesh"]:
         _write_attribute(mesh, container.SOURCE_ATTRIBUTE, "INT", baked.source, "FACE")
+    if baked.texels is not None:
+        _write_attribute(mesh, TEXEL_ATTRIBUTE, "INT", texel_numbers(baked.texels))
+        _write_attribute(mesh, TRIANGLE_ATTRIBUTE, "INT", baked.texels.triangle)
+        mesh[ATLAS_PROPERTY] = flatten_surface(baked.texels)
     mesh[container.HEADER_PROPERTY] = json.dumps(header)
 
 
@@ -355,6 +372,15 @@ def _read_optional(mesh: bpy.types.Mesh, name: str, kind: str, domain: str) -> N
     return values if values.dtype.kind == "i" or np.isfinite(values).all() else None
 
 
+def _read_texels(mesh: bpy.types.Mesh, header: dict, triangles: NDArray[np.int32], subject: str) -> TexelSurface | None:
+    """The atlas of a bake at texels; None of one at vertices. Raises StorageError where it is broken."""
+    if ATLAS not in header:
+        return None
+    number, triangle = (_read_attribute(mesh, name, 1, subject) for name in (TEXEL_ATTRIBUTE, TRIANGLE_ATTRIBUTE))
+    flat = _read_numbers(mesh, ATLAS_PROPERTY) if ATLAS_PROPERTY in mesh else None
+    return read_texels(header, flat, number, triangle, triangles, subject, container.REBAKE)
+
+
 def _read_bases(mesh: bpy.types.Mesh, subject: str) -> NDArray[np.float32]:
     """The flattened bases. Raises StorageError where the property is missing or was replaced by something else."""
     if container.BASES_PROPERTY not in mesh:
@@ -380,7 +406,7 @@ def _clear_mesh(mesh: bpy.types.Mesh) -> None:
     for name in [a.name for a in mesh.attributes if a.name.startswith(OURS)]:
         mesh.attributes.remove(mesh.attributes[name])
     for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY, container.CLOUD_PROPERTY,
-                container.KERNELS_PROPERTY):
+                container.KERNELS_PROPERTY, ATLAS_PROPERTY):
         if key in mesh:
             del mesh[key]
     clear_live(mesh)

@@ -16,13 +16,15 @@ from ..errors import StorageError
 from ..lighting.light_cloud import LightCloud
 from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..relighting.lamp_highlights import LampSurfaces
+from ..scene.texel_surface import TexelSurface
 from ..transport.live_operator import LiveOperator
 from .columns import LIT_SURFACES, Columns, cloud_part, cubemap_size, read_columns
 from .lamp_surfaces import read_lamp_surfaces
+from .texels import ENTRY as ATLAS_ENTRY
 
 # Highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too; 4: of a
-# cubemap, too.
-SCHEMA = 4
+# cubemap, too; 5: points that are texels, too.
+SCHEMA = 5
 CLUSTER_ATTRIBUTE = "prt_cluster"
 WEIGHTS_ATTRIBUTE = "prt_weights_"
 ALBEDO_ATTRIBUTE = "prt_albedo"
@@ -59,6 +61,8 @@ class BakedTransfer:
     source: (t,) int32, which of the source mesh's triangles each one is or is a part of; None in bakes that did not
     keep it. error: (p,) float32, how far off M_p is, relative to the RMS of the object's transfer; None likewise.
     live: the form factors of the whole bake, on one of its objects, where it keeps them for edits of materials.
+    texels: the surface that points lie on where they are texels, triangles then joining neighbouring ones; None where
+    points are vertices.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
     x tangent, y normal x tangent, z normal.
@@ -78,6 +82,20 @@ class BakedTransfer:
     source: NDArray[np.int32] | None = None
     error: NDArray[np.float32] | None = None
     live: LiveOperator | None = None
+    texels: TexelSurface | None = None
+
+    @property
+    def drawn(self) -> tuple[NDArray[np.floating], NDArray[np.int32], NDArray[np.int32] | None]:
+        """Positions, triangles and their sources of the surface itself: of its vertices, also where points are texels.
+        """
+        if self.texels is None:
+            return self.positions, self.triangles, self.source
+        return self.texels.points.astype(np.float32), self.texels.triangles, self.texels.source
+
+    @property
+    def faces(self) -> NDArray[np.float64] | None:
+        """(p, 3) unit normals of the triangles that texels lie on; None for vertices."""
+        return None if self.texels is None else self.texels.faces
 
     @property
     def material(self) -> NDArray[np.int32] | None:
@@ -123,7 +141,9 @@ def make_header(shape: tuple[int, ...], columns: dict[str, Any], rows: dict[str,
 
     shape: of the bases (clusters, vectors + 1, rows, columns, channels).
     """
-    schema = 4 if cubemap_size(columns) else 3 if cloud_part(columns) else 1 if rows.get("kind") == "constant" else 2
+    schema = 1 if rows.get("kind") == "constant" else 2
+    for higher, applies in ((3, cloud_part(columns)), (4, cubemap_size(columns)), (5, ATLAS_ENTRY in extra)):
+        schema = higher if applies else schema
     return {
         "schema": schema,
         "shape": [int(s) for s in shape],
