@@ -27,6 +27,7 @@ import numpy as np
 
 FOLDER = Path(__file__).resolve().parent
 sys.path.insert(0, str(FOLDER))  # the copied modules beside this script
+from prt_addon.relighting.subsurface_texels import link_texels, unpacked_links
 from prt_addon.transport.dipole import Medium
 from prt_addon.transport.subsurface_links import adaptive_links
 from prt_addon.transport.surface_pyramid import SurfacePyramid
@@ -54,8 +55,7 @@ class Device:
 
     def __init__(self) -> None:
         self.context = moderngl.create_context(standalone=True, backend="egl", require=430)
-        self.programs = {name: self.context.compute_shader((FOLDER / f"{name}.glsl").read_text())
-                         for name in ("lamp", "reduce", "gather", "shade")}
+        self.programs = {path.stem: self.context.compute_shader(path.read_text()) for path in FOLDER.glob("*.glsl")}
 
     def texture(self, values: np.ndarray | int) -> moderngl.Texture:
         """Texels (n, 4), or room for so many, row after row."""
@@ -78,7 +78,7 @@ class Device:
         program = self.programs[name]
         for slot, texture in enumerate(samplers):
             texture.use(slot)
-        image.bind_to_image(0, read=name == "reduce", write=True)
+        image.bind_to_image(0, read=name.startswith("reduce"), write=True)
         for key, value in constants.items():
             program[key].value = value
         program.run(WIDTH // GROUP, -(-count // WIDTH), 1)
@@ -115,10 +115,14 @@ class Body:
         geometry[:, :3], geometry[:, 3] = texels.points[pyramid.texel], pyramid.area[:self.places]
         geometry[:, 4:7], geometry[:, 7] = texels.normals[pyramid.texel], IOR
         self.geometry = device.texture(geometry.reshape(-1, 4))
-        values = np.empty((links, self.places, 4), np.float32)
-        values[..., 0], values[..., 1:] = self.linked.node.T, self.linked.factor.transpose(1, 0, 2)
-        self.link_values = device.texture(values.reshape(-1, 4))
-        self.pyramid_values, self.scattered = device.texture(len(pyramid.area)), device.texture(self.places)
+        packed = link_texels(self.linked)
+        self.linked = unpacked_links(packed)  # as the shaders see them
+        self.link_values = device.texture(packed.transpose(1, 0, 2).reshape(-1, 4))
+        centres = np.zeros((len(pyramid.area), 4), np.float32)
+        centres[:, :3] = pyramid.centre
+        self.centres = device.texture(centres)
+        self.nodes = {"": device.texture(4 * len(pyramid.area)), "_plain": device.texture(len(pyramid.area))}
+        self.scattered, self.kind = device.texture(self.places), ""
         self.vertices = len(mesh["positions"])
         leaving = np.zeros((self.vertices, 4), np.float32)
         leaving[:, 0] = _texel_of_vertex(mesh["triangles"], texels, pyramid, self.vertices)
@@ -126,18 +130,24 @@ class Body:
         self.leaving, self.nothing = device.texture(leaving), device.texture(np.zeros((2 * self.vertices, 4)))
         self.shaded = device.texture(2 * self.vertices)
 
+    @property
+    def pyramid_values(self) -> moderngl.Texture:
+        """Nodes with moments, or with the means alone."""
+        return self.nodes[self.kind]
+
     def irradiance(self, lamp: tuple[float, ...]) -> None:
-        self.device.run("lamp", self.places, [self.geometry], self.pyramid_values, places=self.places, lamp=lamp)
+        self.device.run("lamp" + self.kind, self.places, [self.geometry], self.pyramid_values, places=self.places,
+                        lamp=lamp)
 
     def reduce(self) -> None:
         start = self.pyramid.start
         for level in range(1, self.pyramid.levels):
             count = int(start[level] - start[level - 1]) // 4
-            self.device.run("reduce", count, [], self.pyramid_values,
-                            level_range=(int(start[level - 1]), int(start[level]), count))
+            self.device.run("reduce" + self.kind, count, [] if self.kind else [self.centres], self.pyramid_values,
+                            level_range=(int(start[level - 1]), int(start[level]), count, level - 1))
 
     def gather(self, links: int) -> None:
-        self.device.run("gather", self.places, [self.link_values, self.pyramid_values], self.scattered,
+        self.device.run("gather" + self.kind, self.places, [self.link_values, self.pyramid_values], self.scattered,
                         places=self.places, links=links)
 
     def shade(self) -> None:
@@ -146,12 +156,11 @@ class Body:
 
     def difference(self) -> float:
         """Largest difference of what the passes found to numpy's sum over the same links, relative to its largest."""
-        means = self.device.read(self.pyramid_values, len(self.pyramid.area))
-        level0 = means[:self.places]
-        wanted = self.pyramid.means(level0[np.argsort(self.pyramid.texel)])
-        some = np.random.default_rng(0).choice(self.places, 20000)
-        sums = np.sum(self.linked.factor[some] * wanted[self.linked.node[some]], axis=1)
-        found = self.device.read(self.scattered, self.places)[some]
+        step = 1 if self.kind else 4
+        level0 = self.device.read(self.pyramid_values, step * self.places)[::step]
+        means = self.pyramid.means(level0[np.argsort(self.pyramid.texel)])
+        sums = self.linked.gathered(means, None if self.kind else self.pyramid.moments(means))
+        found = self.device.read(self.scattered, self.places)
         return float(np.abs(found - sums).max() / np.abs(sums).max())
 
 
@@ -234,15 +243,16 @@ def main() -> None:
     info = device.context.info
     print(f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}; {len(mesh['triangles'])} triangles, "
           f"{len(mesh['positions'])} vertices; milliseconds, median of {arguments.repeats}", flush=True)
-    print("| atlas | links | atlas s | link s (CPU) | irradiance | pyramid | gather | shade | draw | frame | "
-          "frames/s | off |\n|" + " --- |" * 12, flush=True)
+    print("| atlas | kind | links | atlas s | link s (CPU) | irradiance | pyramid | gather | shade | draw | frame | "
+          "frames/s | off |\n|" + " --- |" * 13, flush=True)
     picture, results = Picture(device, mesh), []
     for side in arguments.sides:
         body = Body(device, mesh, side, max(arguments.links), arguments.threads)
-        for links in arguments.links:
-            results.append(timed(device, body, picture, side, links, arguments.repeats))
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    picture.save(arguments.output / "device_subsurface.png")
+        for body.kind in ("_plain", ""):
+            for links in arguments.links:
+                results.append(timed(device, body, picture, side, links, arguments.repeats))
+            arguments.output.mkdir(parents=True, exist_ok=True)
+            picture.save(arguments.output / f"device_subsurface_{side}{body.kind}.png")
     print(json.dumps({"renderer": info["GL_RENDERER"], "seconds": time.perf_counter() - started, "rows": results}))
 
 
@@ -268,9 +278,9 @@ def timed(device: Device, body: Body, picture: Picture, side: int, links: int, r
     body.irradiance(lamp)
     for work in (body.reduce, lambda: body.gather(links), body.shade, lambda: picture.draw(body.shaded)):
         work()
-    row |= {"side": side, "links": links, "frame": 1e3 * frame, "off": difference,
-            "atlas_seconds": body.atlas_seconds, "link_seconds": body.link_seconds}
-    print(f"| {side}^2 | {links} | {body.atlas_seconds:.1f} | {body.link_seconds:.1f} | "
+    row |= {"side": side, "kind": "paper" if body.kind else "moments", "links": links, "frame": 1e3 * frame,
+            "off": difference, "atlas_seconds": body.atlas_seconds, "link_seconds": body.link_seconds}
+    print(f"| {side}^2 | {row['kind']} | {links} | {body.atlas_seconds:.1f} | {body.link_seconds:.1f} | "
           + " | ".join(f"{row[name]:.4f}" for name in parts)
           + f" | {row['frame']:.3f} | {1.0 / frame:.0f} | {difference:.1e} |", flush=True)
     return row

@@ -36,7 +36,8 @@ COLOUR = (0.85, 0.6, 0.4)
 # Mean free paths as shares of the diagonal: marble-like, and one that light hardly leaves.
 PATHS = {"deep": (0.05, 0.03, 0.02), "middle": (0.02, 0.012, 0.006), "shallow": (0.005, 0.003, 0.0015)}
 EXPORTED = ("__init__.py", "errors.py", "transport/__init__.py", "transport/dipole.py", "transport/surface_pyramid.py",
-            "transport/surface_texels.py", "transport/subsurface_links.py")
+            "transport/surface_texels.py", "transport/subsurface_links.py", "relighting/__init__.py",
+            "relighting/subsurface_texels.py")
 
 
 def normalised(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
@@ -63,8 +64,10 @@ def export(folder: Path, mesh: Path) -> None:
     from prt.gpu_shaders import subsurface_programs as programs
 
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("LAMP", "REDUCE", "GATHER", "SHADE"):
-        (folder / f"{name.lower()}.glsl").write_text(getattr(programs, name).glsl())
+    for name in ("lamp", "reduce", "gather", "shade"):
+        (folder / f"{name}.glsl").write_text(programs.program(name).glsl())
+        if name != "shade":
+            (folder / f"{name}_plain.glsl").write_text(programs.program(name, moments=False).glsl())
     for name in EXPORTED:
         target = folder / "prt_addon" / name
         target.parent.mkdir(parents=True, exist_ok=True)

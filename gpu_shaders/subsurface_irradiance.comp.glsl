@@ -17,5 +17,5 @@ void main()
     ivec2 lit = texel(int(own.x) * rows);
     value.rgb = own.y * (texelFetch(direct_values, lit, 0).rgb + bounced_share * texelFetch(bounced_values, lit, 0).rgb);
   }
-  imageStore(pyramid_values, texel(place), value);
+  imageStore(pyramid_values, texel(NODE_TEXELS * place), value);
 }

@@ -20,5 +20,5 @@ void main()
   float along = (normal.w * cosine - inside) / max(normal.w * cosine + inside, 1e-6);
   float transmitted = 1.0 - 0.5 * (upright * upright + along * along);
   float irradiance = cosine > 0.0 ? lamp.w * cosine / squared * transmitted : 0.0;
-  imageStore(pyramid_values, texel(place), vec4(vec3(irradiance), position.w));
+  imageStore(pyramid_values, texel(NODE_TEXELS * place), vec4(vec3(irradiance), position.w));
 }

@@ -1,40 +1,43 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The compute programs of live subsurface light, and how their lists lie in textures. Imports neither gpu nor bpy."""
+"""The compute programs of live subsurface light. Imports neither gpu nor bpy.
+
+Each comes with moments (links take the light at a place within their node, NODE_TEXELS = 4) and without (the links of
+Carr et al. 2003, one texel for each node), which only the benchmark uses.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..prt_addon.relighting.subsurface_texels import FACTOR_SCALE, LEAST_SHIFT
 from .compute_program import ComputeProgram
-from .render_data import TEXTURE_WIDTH, texture_values
+from .render_data import TEXTURE_WIDTH
 
 GROUP_SIZE = 64
-_LAYOUT = "texel_layout.glsl"
-_WIDTH = (("TEXTURE_WIDTH", str(TEXTURE_WIDTH)),)
+NODE_TEXELS = 4
+_SAMPLERS = {
+    "irradiance": ("place_values", "direct_values", "bounced_values"), "lamp": ("geometry_values",),
+    "reduce": ("centre_values",), "gather": ("link_values", "pyramid_values"),
+    "shade": ("direct_values", "bounced_values", "scattered_values", "leaving_values"),
+}
+_IMAGES = {"irradiance": ("pyramid_values", "WRITE"), "lamp": ("pyramid_values", "WRITE"),
+           "reduce": ("pyramid_values", "READ_WRITE"), "gather": ("scattered_values", "WRITE"),
+           "shade": ("shaded_values", "WRITE")}
+_CONSTANTS = {
+    "irradiance": (("INT", "places"), ("INT", "rows"), ("FLOAT", "bounced_share")),
+    "lamp": (("INT", "places"), ("VEC4", "lamp")), "reduce": (("IVEC4", "level_range"),),
+    "gather": (("INT", "places"), ("INT", "links")),
+    "shade": (("INT", "points"), ("INT", "rows"), ("FLOAT", "bounced_share")),
+}
 
 
-def _program(name: str, samplers: tuple[str, ...], image: tuple[str, str], *constants: tuple[str, str],
-             ) -> ComputeProgram:
-    return ComputeProgram((_LAYOUT, f"subsurface_{name}.comp.glsl"), samplers, (image,), constants, _WIDTH,
-                          (GROUP_SIZE, 1, 1))
-
-
-IRRADIANCE = _program("irradiance", ("place_values", "direct_values", "bounced_values"), ("pyramid_values", "WRITE"),
-                      ("INT", "places"), ("INT", "rows"), ("FLOAT", "bounced_share"))
-LAMP = _program("lamp", ("geometry_values",), ("pyramid_values", "WRITE"), ("INT", "places"), ("VEC4", "lamp"))
-REDUCE = _program("reduce", (), ("pyramid_values", "READ_WRITE"), ("IVEC3", "level_range"))
-GATHER = _program("gather", ("link_values", "pyramid_values"), ("scattered_values", "WRITE"),
-                  ("INT", "places"), ("INT", "links"))
-SHADE = _program("shade", ("direct_values", "bounced_values", "scattered_values", "leaving_values"),
-                 ("shaded_values", "WRITE"), ("INT", "points"), ("INT", "rows"), ("FLOAT", "bounced_share"))
-
-
-def link_texels(node: NDArray[np.integer], factor: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Links (places, K) with factors (places, K, 3) as a texture: texel k * places + place. Raises BadScene where they
-    do not fit one."""
-    places, links = node.shape
-    values = np.empty((links * places, 4), np.float32)
-    values[:, 0] = node.T.ravel()  # exact up to 2^24 nodes
-    values[:, 1:] = factor.transpose(1, 0, 2).reshape(-1, 3)
-    return texture_values(values)
+def program(name: str, moments: bool = True) -> ComputeProgram:
+    """irradiance or lamp (pass one), reduce (its pyramid), gather (pass two) or shade (pass three)."""
+    defines = [("TEXTURE_WIDTH", str(TEXTURE_WIDTH))]
+    if name not in ("shade",):
+        defines.append(("NODE_TEXELS", str(NODE_TEXELS if moments else 1)))
+    if name == "gather":
+        defines += [("FACTOR_SCALE", f"{FACTOR_SCALE:.1f}"), ("LEAST_SHIFT", f"{LEAST_SHIFT:.9f}")]
+    if moments and name in ("reduce", "gather"):
+        defines.append(("MOMENTS", "1"))
+    samplers = () if name == "reduce" and not moments else _SAMPLERS[name]
+    return ComputeProgram(("texel_layout.glsl", f"subsurface_{name}.comp.glsl"), samplers, (_IMAGES[name],),
+                          _CONSTANTS[name], tuple(defines), (GROUP_SIZE, 1, 1))

@@ -13,7 +13,16 @@ line is the largest throughput factor (the paper's rule), or that times how much
 far large node has a large factor and needs no refinement.
 
 Then every receiver's tree is refined further, to `resolved` nodes, and each link's factor is the sum over the nodes
-that came of it: a coarse link still carries the right light for even irradiance. Two facts bound the sums: a surface
+that came of it: a coarse link still carries the right light for even irradiance. What the paper leaves as seams is the
+part of a node that a receiver sees best: a few links per texel show blocks where the cut changes. So a link also
+remembers where in the node its light comes from, the mean g of (y - centre) weighted by the factor, and takes the
+irradiance there, by the plane that fits the node's texels best,
+
+    E_k(g) = mean E + shift . moment,     moment = mean of (y - centre) (E - mean E),     shift = covariance^-1 g.
+
+Moments rise through the pyramid with the means. (On the bunny 16 such links are as near as 64 without.)
+
+Two facts bound the sums: a surface
 without overlaps that faces as the receiver does gives no more than a flat one, R; so does what faces the other way
 (the far side of a sheet); and both together no more than 1.
 
@@ -42,20 +51,30 @@ WIDE = 0.3
 # Nodes to which a receiver's sum is resolved, for each of its links, and at least.
 RESOLVED, LEAST_RESOLVED = 4, 64
 RULES = ("factor", "spread")
+# Variance, as a share of all of it, that is taken for granted across a node's surface: a flat one says nothing of how
+# light changes there.
+FLATTEST = 0.02
 
 
 @dataclass(frozen=True)
 class Links:
     """K links of r receivers. node: (r, K) int32 of the pyramid; factor: (r, K, 3) float32, 0 where a receiver has
-    fewer; bounded: (3,) share of the light under even irradiance that the bounds took, 0..1."""
+    fewer; shift: (r, K, 3) float32, see above, per unit of the pyramid's size; bounded: (3,) share of the light under
+    even irradiance that the bounds took, 0..1."""
 
     node: NDArray[np.int32]
     factor: Single
+    shift: Single
     bounded: NDArray[np.float64]
 
-    def gathered(self, means: Single) -> Single:
-        """B (r, 3) of means (m, 3) of the pyramid's nodes."""
-        return np.sum(self.factor * means[self.node], axis=1)
+    def gathered(self, means: Single, moments: Single | None = None) -> Single:
+        """B (r, 3) of means (m, 3) of the pyramid's nodes, and their moments (m, 3, 3); None for the paper's links."""
+        light = means[self.node]
+        if moments is not None:
+            for axis in range(3):
+                light += self.shift[..., axis, None] * moments[self.node, axis]
+            np.maximum(light, 0.0, out=light)
+        return np.sum(self.factor * light, axis=1)
 
     @property
     def sums(self) -> Single:
@@ -110,12 +129,13 @@ def _linked(pyramid: SurfacePyramid, places: NDArray[np.integer], medium: Medium
     """Links of all receivers, block by block. first: nodes that each receiver starts with."""
     table, places = _Table.of(pyramid, medium), np.asarray(places, np.int32)
     limit = max(LEAST_RESOLVED, RESOLVED * links) if resolved is None else max(resolved, links)
-    result = Links(np.zeros((len(places), links), np.int32), np.zeros((len(places), links, 3), np.float32), np.zeros(3))
+    result = Links(np.zeros((len(places), links), np.int32), *np.zeros((2, len(places), links, 3), np.float32),
+                   np.zeros(3))
     before, after = np.zeros((2, len(table.kernels)))
     blocks = [slice(start, start + BLOCK) for start in range(0, len(places), BLOCK)]
     work = _each(lambda block: _link_block(table, places[block], first, links, rule, limit), blocks, threads)
-    for block, (node, factor, sums) in zip(blocks, work, strict=True):
-        result.node[block] = node
+    for block, (node, factor, shift, sums) in zip(blocks, work, strict=True):
+        result.node[block], result.shift[block] = node, shift
         result.factor[block] = factor[:, :, list(table.kernel_of)]
         before, after = before + sums, after + factor.sum(axis=(0, 1), dtype=np.float64)
     taken = np.divide(before - after, before, out=np.zeros_like(before), where=before > 0.0)
@@ -133,29 +153,42 @@ def _each[Item, Result](work: Callable[[Item], Result], items: list[Item], threa
 
 
 def _link_block(table: _Table, places: NDArray[np.int32], first: NDArray[np.int64], links: int, rule: str,
-                limit: int) -> tuple[NDArray[np.int32], Single, NDArray[np.float64]]:
-    """Nodes (b, links), factors (b, links, kernels) and the sum of the factors before their bounds (kernels,)."""
+                limit: int) -> tuple[NDArray[np.int32], Single, Single, NDArray[np.float64]]:
+    """Nodes (b, links), factors (b, links, kernels), shifts (b, links, 3) and the sum of the factors before their
+    bounds (kernels,)."""
     cut = _Cut.starting(table, places, first, limit)
     cut.refine(links, rule, 0.0)
     chosen, number = cut.nodes[:, :links].copy(), len(places)
     cut.owner[:, :links] = np.arange(links)
     # What is left to gain below a ten-thousandth of R is not worth its time.
     cut.refine(limit, "spread", 1e-4 * float(np.mean(table.flat[list(table.kernel_of)])))
-    factor = cut.factor[:, :limit]
+    factor, nodes = cut.factor[:, :limit], cut.nodes[:, :limit]
     before = factor.sum(axis=(0, 1), dtype=np.float64)
     table.bound(factor, cut.facing[:, :limit])
-    slot = (np.arange(number)[:, None] * links + cut.owner[:, :limit]).ravel()
-    sums = [np.bincount(slot, factor[..., kernel].ravel(), number * links) for kernel in range(factor.shape[2])]
-    return chosen, np.stack(sums, axis=1).reshape(number, links, -1).astype(np.float32), before
+    slot = np.arange(number)[:, None] * links + cut.owner[:, :limit]
+
+    def summed(values: Single) -> NDArray[np.float64]:
+        return np.bincount(slot.ravel(), values.ravel(), number * links).reshape(number, links)
+
+    weight = factor.sum(axis=2)
+    whole = np.maximum(summed(weight), np.finfo(np.float32).tiny)
+    centre = table.packed[nodes, :3] - table.packed[places, None, :3]  # about the receiver: precise where it is near
+    foot = table.packed[chosen, :3] - table.packed[places, None, :3]
+    apart = np.stack([summed(weight * centre[..., axis]) / whole for axis in range(3)], axis=2) - foot
+    apart[summed(weight) == 0.0] = 0.0
+    sums = np.stack([summed(factor[..., kernel]) for kernel in range(factor.shape[2])], axis=2)
+    return chosen, sums.astype(np.float32), table.shifts(chosen, apart), before
 
 
 @dataclass(frozen=True)
 class _Table:
-    """What factors are made of. packed: (m, 16) float32 centre, area, covariance, normal: a cache line per node; cap:
-    (m, kernels) R_d's integral over a disc of the node's area; flat: (kernels,) R of a half-space."""
+    """What factors are made of. packed: (m, 16) float32 centre, area, covariance, normal: a cache line per node;
+    inverse: (m, 6) of the covariance, 0 at level 0; cap: (m, kernels) R_d's integral over a disc of the node's area;
+    flat: (kernels,) R of a half-space."""
 
     pyramid: SurfacePyramid
     packed: Single
+    inverse: Single
     cap: Single
     kernels: tuple[Poles, ...]
     kernel_of: tuple[int, ...]
@@ -169,7 +202,10 @@ class _Table:
         packed[:, :3], packed[:, 3], packed[:, 4:10] = pyramid.centre, pyramid.area, pyramid.covariance
         packed[:, 10:13] = pyramid.normal
         cap = np.stack([disc_integral(p, pyramid.area.astype(np.float64) / np.pi) for p in kernels], axis=1)
-        return _Table(pyramid, packed, cap.astype(np.float32), kernels, tuple(kernels.index(p) for p in poles),
+        inverse = np.zeros((len(pyramid.area), 6), np.float32)
+        above = slice(int(pyramid.start[1]), None)
+        inverse[above] = _inverse(pyramid.covariance[above])
+        return _Table(pyramid, packed, inverse, cap.astype(np.float32), kernels, tuple(kernels.index(p) for p in poles),
                       np.array([plane_integral(p) for p in kernels]))
 
     def factors(self, places: NDArray[np.int32], nodes: NDArray[np.int32],
@@ -201,6 +237,12 @@ class _Table:
             result[..., kernel] = value
         return result, np.minimum(variation, 1.0), facing
 
+    def shifts(self, nodes: NDArray[np.int32], apart: NDArray[np.float64]) -> Single:
+        """covariance^-1 apart (b, k, 3) of nodes (b, k)."""
+        c, (x, y, z) = self.inverse[nodes], np.moveaxis(apart, -1, 0)
+        return np.stack([c[..., 0] * x + c[..., 3] * y + c[..., 4] * z, c[..., 3] * x + c[..., 1] * y + c[..., 5] * z,
+                         c[..., 4] * x + c[..., 5] * y + c[..., 2] * z], axis=-1).astype(np.float32)
+
     def bound(self, factor: Single, facing: NDArray[np.bool_]) -> None:
         """Scale factors (b, k, kernels) down, in place, to what surfaces can give."""
         for kernel, flat in enumerate(self.flat):
@@ -210,6 +252,17 @@ class _Table:
             total = front * scale[0] + (whole - front) * scale[1]
             last = 1.0 / np.maximum(total, 1.0)
             mine *= np.where(facing, (scale[0] * last)[:, None], (scale[1] * last)[:, None])
+
+
+def _inverse(covariance: Single) -> NDArray[np.float64]:
+    """Inverses (n, 6) of covariances (n, 6), each with FLATTEST of its trace added along all axes; 0 of 0."""
+    xx, yy, zz, xy, xz, yz = covariance.T.astype(np.float64)
+    trace = xx + yy + zz
+    xx, yy, zz = (value + FLATTEST * trace for value in (xx, yy, zz))
+    adjugate = np.stack([yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy, xz * yz - xy * zz, xy * yz - xz * yy,
+                         xy * xz - xx * yz], axis=1)
+    determinant = xx * adjugate[:, 0] + xy * adjugate[:, 3] + xz * adjugate[:, 4]
+    return np.divide(adjugate, determinant[:, None], out=np.zeros_like(adjugate), where=determinant[:, None] > 0.0)
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,23 @@ class SurfacePyramid:
         return result
 
 
+    def moments(self, means: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Of means (m, 3), the mean over each node of (y - centre) (E - mean E): (m, 3, 3) float32 by axis and channel,
+        lengths in units of `size`; 0 at level 0."""
+        result = np.zeros((len(means), 3, 3), np.float32)
+        for level in range(1, self.levels):
+            below = slice(self.start[level - 1], self.start[level])
+            count = (below.stop - below.start) // 4
+            mine = slice(self.start[level], self.start[level] + count)
+            share = np.divide(self.area[below].reshape(count, 4), self.area[mine, None],
+                              out=np.zeros((count, 4), np.float32), where=self.area[mine, None] > 0.0)
+            apart = self.centre[below].reshape(count, 4, 3) - self.centre[mine, None]
+            light = means[below].reshape(count, 4, 3) - means[mine, None]
+            values = result[below].reshape(count, 4, 3, 3) + apart[:, :, :, None] * light[:, :, None]
+            result[mine] = np.sum(share[:, :, None, None] * values, axis=1)
+        return result
+
+
 def _height(count: int) -> int:
     """Levels above level 0 until one node stands for so many texels."""
     height = 0
