@@ -257,10 +257,11 @@ def main() -> int:
         blender = Blender(arguments.ui, arguments.headless, output, Path(resources))
         outcomes = [run_check(check_install, blender, arguments.zip.resolve())]
         if arguments.only in (None, "commands"):
-            scene = make_scene(blender, "make_scene.py", outcomes)
-            outcomes += [run_check(check, blender, scene)
-                         for check in (check_bad_arguments, check_command_bake, check_interrupt)]
-            outcomes.append(run_check(check_kill_among_lamps, blender, make_scene(blender, "make_room.py", outcomes)))
+            with blender.apart() as own:
+                scene = make_scene(own, "make_scene.py", outcomes)
+                outcomes += [run_check(check, own, scene)
+                             for check in (check_bad_arguments, check_command_bake, check_interrupt)]
+                outcomes.append(run_check(check_kill_among_lamps, own, make_scene(own, "make_room.py", outcomes)))
         for name, (script, maker) in SCRIPTS.items():
             if arguments.only in (None, name):
                 with blender.apart() as own:
