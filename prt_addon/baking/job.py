@@ -24,6 +24,7 @@ from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_clo
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from ..storage.subsurface_links import flatten_links, read_links
 from .claims import Claim
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
@@ -134,6 +135,8 @@ def run_job(folder: Path) -> Generator[Progress]:
         result.objects.values()) if container.cloud is not None}
     arrays |= {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
                for name in _LAMP_ARRAYS if container.lamp_surfaces is not None}
+    arrays |= {f"{index}_links": flatten_links(container.links) for index, container in enumerate(
+        result.objects.values()) if container.links is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -149,7 +152,8 @@ def read_result(folder: Path) -> BakeResult:
         cloud = read_cloud(check_header(header, name), arrays.get(f"{index}_cloud"), name)
         lamps = read_lamp_surfaces(header, *(arrays.get(f"{index}_{part}") for part in _LAMP_ARRAYS), len(parts[0]),
                                    name, REBAKE)
-        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps)
+        links = read_links(header, arrays.get(f"{index}_links"), len(parts[0]), name, REBAKE)
+        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps, links=links)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

@@ -44,7 +44,7 @@ from .surface_pyramid import SurfacePyramid
 
 Single = NDArray[np.float32]
 # Receivers linked at once: their lists of nodes stay in the cache.
-BLOCK = 2048
+BLOCK = 1024
 # A node is integrated to second order where its variance is at most this share of the squared distance, depth included;
 # beyond, it is taken as a disc about the receiver's foot.
 WIDE = 0.3
@@ -109,9 +109,8 @@ def full_sum(pyramid: SurfacePyramid, places: NDArray[np.integer], medium: Mediu
         nodes = np.broadcast_to(leaves, (len(rows), len(leaves)))
         factor, facing = table.factors(rows, nodes)[::2]
         table.bound(factor, facing)
-        sums = np.stack([factor[..., kernel] @ means[leaves, channel]  # small: a few rows
-                         for channel, kernel in enumerate(table.kernel_of)], axis=1)
-        result[start:start + 8] = sums
+        for channel, kernel in enumerate(table.kernel_of):
+            result[start:start + 8, channel] = np.sum(factor[..., kernel] * means[leaves, channel], axis=1)
     return result
 
 

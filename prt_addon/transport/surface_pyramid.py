@@ -78,6 +78,13 @@ class SurfacePyramid:
         return _pyramid(texel, points.reshape(-1, 3), normals.reshape(-1, 3), areas.ravel(), height,
                         (np.array([height]), np.zeros(1, np.int64)))
 
+    @staticmethod
+    def of_places(texel: NDArray[np.integer], points: NDArray[np.floating], normals: NDArray[np.floating],
+                  areas: NDArray[np.floating], levels: int) -> SurfacePyramid:
+        """A pyramid of so many levels whose level 0 is known, `texel`; without roots."""
+        return _pyramid(np.asarray(texel, np.int64), points, normals, areas, levels - 1,
+                        (np.zeros(0, np.int64), np.zeros(0, np.int64)))
+
     @property
     def levels(self) -> int:
         """Their number, level 0 among them."""

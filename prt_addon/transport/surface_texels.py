@@ -43,7 +43,7 @@ def texels_on_mesh(positions: NDArray[np.floating], normals: NDArray[np.floating
     outside = square.sum(axis=1) > 1.0
     square[outside] = 1.0 - square[outside]
     weights = np.concatenate([1.0 - square.sum(axis=1, keepdims=True), square], axis=1)
-    points = np.einsum("nk,nkc->nc", weights, corners[triangle])
-    towards = np.einsum("nk,nkc->nc", weights, np.asarray(normals, np.float64)[triangles[triangle]])
+    points = np.sum(weights[:, :, None] * corners[triangle], axis=1)
+    towards = np.sum(weights[:, :, None] * np.asarray(normals, np.float64)[triangles[triangle]], axis=1)
     length = np.maximum(np.sqrt(np.sum(towards**2, axis=1, keepdims=True)), 1e-300)
     return SurfaceTexels(points, towards / length, np.full(count, along[-1] / count), triangle, weights)
