@@ -45,14 +45,15 @@ def _links(scene: SceneMesh, target: SceneObject, chosen: NDArray[np.int64], num
     pyramid = SurfacePyramid.over_points(scene.points[points], scene.normals[points], areas, body)
     count = int(pyramid.start[1])
     used = pyramid.texel >= 0
-    places, texels = np.zeros((count, 4), np.float32), np.zeros((count, links, 4), np.float32)
+    row = np.cumsum(used) - 1
+    places, texels = np.zeros((count, 4), np.float32), np.zeros((int(used.sum()), links, 4), np.float32)
     places[:, 0] = np.where(used, chosen[pyramid.texel], -1)
     places[used, 3] = areas[pyramid.texel[used]]
     for index, number in enumerate(numbers):
         material = scene.materials[number]
         mine = np.flatnonzero(used & (body[pyramid.texel] == index))
         medium = Medium.of_principled(material.base_colour, material.subsurface_radius)
-        texels[mine] = link_texels(adaptive_links(pyramid, mine, medium, links, body=index, threads=threads))
+        texels[row[mine]] = link_texels(adaptive_links(pyramid, mine, medium, links, body=index, threads=threads))
         places[mine, 1] = material.subsurface_weight * (1.0 - material.metallic)
         places[mine, 2] = material.subsurface_weight
     return SubsurfaceLinks(places, texels, pyramid.levels)

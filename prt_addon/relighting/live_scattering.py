@@ -35,7 +35,8 @@ BLOCK = 2048
 class SubsurfaceLinks:
     """What a bake keeps. places: (n, 4) float32, per texel of level 0 the receiver that it stands for (-1: none), the
     factor on what went through the body, the share of the diffuse light that goes through it, and its area in square
-    metres; texels: (n, K, 4) float32, see `subsurface_texels`; levels: of the pyramid."""
+    metres; texels: (used, K, 4) float32, of the places with a receiver in their order, see `subsurface_texels`; levels:
+    of the pyramid."""
 
     places: Single
     texels: Single
@@ -85,9 +86,9 @@ class LiveScattering:
         moments, links = self.pyramid.moments(means), self._unpacked
         result = np.zeros((self._points, 3), np.float32)
         for start in range(0, len(self.used), BLOCK):
-            places = self.used[start:start + BLOCK]
-            some = type(links)(links.node[places], links.factor[places], links.shift[places], links.bounded)
-            result[self.receiver[places]] = some.gathered(means, moments)
+            part = slice(start, start + BLOCK)
+            some = type(links)(links.node[part], links.factor[part], links.shift[part], links.bounded)
+            result[self.receiver[self.used[part]]] = some.gathered(means, moments)
         return result
 
     def added(self, direct: Single, bounced: Single | None) -> Single:

@@ -38,10 +38,14 @@ def read_links(header: dict[str, Any], flat: NDArray | None, points: int, subjec
     if not all(type(size) is int and size > 0 for size in sizes) or flat is None or sizes[2] > 16:
         raise broken
     places, links, levels = sizes
-    values = np.asarray(flat, np.float32)
-    if values.size != 4 * places * (1 + links) or not np.isfinite(values).all():
+    values = np.asarray(flat, np.float32).ravel()
+    if values.size < 4 * places:
         raise broken
-    own, texels = values[:4 * places].reshape(places, 4), values[4 * places:].reshape(places, links, 4)
+    own = values[:4 * places].reshape(-1, 4)
+    used = int((own[:, 0] >= 0.0).sum())
+    if values.size != 4 * (places + used * links) or not used or not np.isfinite(values).all():
+        raise broken
+    texels = values[4 * places:].reshape(used, links, 4)
     count, level = places, places
     for above in range(1, levels):  # nodes of the levels above, each padded to a multiple of 4 but the last
         level //= 4

@@ -52,16 +52,17 @@ class SurfacePyramid:
         counts = np.bincount(body)
         heights = [_height(count) for count in counts]
         places, roots, end = [], np.zeros(len(counts), np.int64), 0
-        # The largest body first: each begins at a multiple of what its root stands for, and little is left between.
-        by_size = np.argsort(-counts, kind="stable")
-        for number in by_size:
+        # The largest body first: each begins at a multiple of what its root stands for, and the next after all of it.
+        for number in np.argsort(-counts, kind="stable"):
             members = np.flatnonzero(body == number)
             step = 4 ** heights[number]
             begin = -(-end // step) * step
-            places.append(np.full(begin - end, -1, np.int64))
-            places.append(members[quadtree_order(np.asarray(points)[members])])
-            roots[number], end = begin // step, begin + len(members)
+            roots[number], end = begin // step, begin + step
+            filled = np.full(step, -1, np.int64)
+            filled[:len(members)] = members[quadtree_order(np.asarray(points)[members])]
+            places += [np.full(begin - sum(map(len, places)), -1, np.int64), filled]
         texel = np.concatenate(places)
+        texel = texel[:int(np.flatnonzero(texel >= 0)[-1]) + 1]
         return _pyramid(texel, points, normals, areas, max(heights), (np.array(heights), roots))
 
     @staticmethod
