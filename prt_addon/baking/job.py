@@ -25,6 +25,7 @@ from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_clo
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from ..storage.subsurface_links import flatten_links, read_links
 from ..storage.texels import ENTRY as ATLAS_ENTRY
 from ..tracing.tracer import Tracer
 from ..transport.live_operator import LiveOperator
@@ -157,6 +158,8 @@ def run_job(folder: Path, make_tracer: Callable[..., Tracer] = Tracer) -> Genera
                if container.live is not None for name, value in container.live.arrays().items()}
     for index, container in enumerate(result.objects.values()):
         arrays |= {} if container.texels is None else _surface_arrays(f"{index}_texels_", container.texels)
+    arrays |= {f"{index}_links": flatten_links(container.links) for index, container in enumerate(
+        result.objects.values()) if container.links is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -176,8 +179,9 @@ def read_result(folder: Path) -> BakeResult:
             if f"{index}_live_counts" in arrays else None
         atlas = header.get(ATLAS_ENTRY)
         texels = None if atlas is None else _surface(f"{index}_texels_", arrays, {k: atlas[k] for k in NUMBERS})
+        links = read_links(header, arrays.get(f"{index}_links"), len(parts[0]), name, REBAKE)
         container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps, live=live,
-                                  texels=texels)
+                                  texels=texels, links=links)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

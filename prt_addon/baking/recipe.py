@@ -58,6 +58,7 @@ from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
 from .lit_highlights import LitHighlights
 from .live_editing import kept_factors, with_live_editing
+from .live_links import with_subsurface_links
 from .local_budget import local_budget
 from .local_highlight_budget import local_highlight_budget
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
@@ -824,6 +825,9 @@ class _Bake:
         }
         if self.local is not None:
             objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
+                       for target in self.targets}
+            objects = {target.name: with_subsurface_links(objects[target.name], self.scene, target,
+                                                          self.settings.subsurface_links, self.tracer.threads)
                        for target in self.targets}
         objects, report["live_editing"] = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces,
                                                             self.albedo, self.buried)

@@ -57,6 +57,8 @@ class BakeSettings:
         most); below, its light stays in the diffuse layer.
     glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
+    subsurface_links: links that each receiver of a translucent material keeps for the light of lamps, so that it
+        travels through the body as they move; 64 serve, 0 = none. 16 bytes each, in the file and on the graphics card.
     distant_basis: what World and Suns are baked in. "sh": spherical harmonics of `order`. "cubemap": the texels of a
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
         harmonics blur them. Costs memory and time with the texels' number, highlights with that of their rows too.
@@ -114,6 +116,7 @@ class BakeSettings:
     glossy_albedo: float = 0.15
     glossy_window: bool = True
     subsurface: bool = True
+    subsurface_links: int = 0
     distant_basis: str = "sh"
     light_error: float = 0.05
     cubemap_size: int = 16
@@ -192,6 +195,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "error_paths": (64, 2 ** 20, "fewer say nothing"),
     "glossy_rows": (0, 25, "order 5 of the hemisphere"),
     "glossy_albedo": (0.0, 1.0, "it is a share of the light"),
+    "subsurface_links": (0, 256, "more than the sum over all receivers needs"),
     "surface_patches": (1, 2 ** 14, "each is one more solution"),
     "surface_columns": (1, 1024, "each is carried by every cluster"),
     "cloud_lights": (1, MOST_CLOUD_LIGHTS, "each is a global illumination solution"),

@@ -25,6 +25,7 @@ from ..scene.texel_surface import TexelSurface
 from ..storage import container
 from ..storage.container import BakedTransfer
 from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
+from ..storage.subsurface_links import flatten_links
 from ..storage.texels import (
     ATLAS_PROPERTY,
     TEXEL_ATTRIBUTE,
@@ -118,8 +119,9 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
     if LAMP_SURFACES in header:
         material = _read_attribute(mesh, container.MATERIAL_ATTRIBUTE, 1, scene_object.name)
         kernels = _read_numbers(mesh, container.KERNELS_PROPERTY) if container.KERNELS_PROPERTY in mesh else None
+    links = _read_numbers(mesh, container.LINKS_PROPERTY) if container.LINKS_PROPERTY in mesh else None
     baked = container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud, material,
-                             kernels)
+                             kernels, links)
     texels = _read_texels(mesh, header, triangles, scene_object.name)
     error = _read_optional(mesh, container.ERROR_ATTRIBUTE, "FLOAT", "POINT")
     source = _read_optional(mesh, container.SOURCE_ATTRIBUTE, "INT", "FACE")
@@ -282,7 +284,7 @@ def _check_shapes(name: str, baked: BakedTransfer) -> None:
     container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
                      (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents,
                      container.flatten_cloud(baked.cloud) if baked.cloud is not None else None, baked.material,
-                     baked.kernels)
+                     baked.kernels, None if baked.links is None else flatten_links(baked.links))
     if baked.weights.shape[1] != representatives - 1:
         raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
 
@@ -321,6 +323,8 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
         _write_attribute(mesh, container.MATERIAL_ATTRIBUTE, "INT", baked.material)
         mesh[container.KERNELS_PROPERTY] = np.ascontiguousarray(baked.kernels, np.float32).ravel()
     write_live(mesh, baked.live)
+    if baked.links is not None:
+        mesh[container.LINKS_PROPERTY] = flatten_links(baked.links)
     if baked.error is not None:
         _write_attribute(mesh, container.ERROR_ATTRIBUTE, "FLOAT", baked.error)
     if baked.source is not None and not header["source"]["on_source_mesh"]:
@@ -406,7 +410,7 @@ def _clear_mesh(mesh: bpy.types.Mesh) -> None:
     for name in [a.name for a in mesh.attributes if a.name.startswith(OURS)]:
         mesh.attributes.remove(mesh.attributes[name])
     for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY, container.CLOUD_PROPERTY,
-                container.KERNELS_PROPERTY, ATLAS_PROPERTY):
+                container.KERNELS_PROPERTY, container.LINKS_PROPERTY, ATLAS_PROPERTY):
         if key in mesh:
             del mesh[key]
     clear_live(mesh)
