@@ -66,7 +66,7 @@ DISTANT_BASIS_ITEMS = (
     ("sh", "Spherical Harmonics", "Smooth functions: small, fast, with highlights and translucency. A sun's shadows "
                                   "are as soft as the order says", 0),
     ("cubemap", "Cubemap", "The texels of a cubemap: shadows of suns as sharp as a texel. Costs several times the time "
-                           "and memory; diffuse light only, metal is black", 1),
+                           "and memory; highlights several times as much again", 1),
     ("auto", "Automatic", "Harmonics or a cubemap, as large as the present light needs for the asked error. Costs a "
                           "second; a sharper light that comes later is shown blurred. Analyze tells what and why", 2),
 )

@@ -55,12 +55,13 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
-        column.active = settings.distant_basis != "cubemap" or settings.lighting == "local"  # a cubemap holds none
         column.prop(settings, "glossy_rows")
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
         shiny.prop(settings, "glossy_albedo")
-        shiny.prop(settings, "glossy_window")
+        window = shiny.column()
+        window.active = settings.distant_basis == "sh"  # texels do not ring
+        window.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
 
 
