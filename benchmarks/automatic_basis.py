@@ -80,7 +80,7 @@ def main() -> None:
     model = upright(options.mesh)
     size = 3.0 * float(np.ptp(model.positions, axis=0).max())
     scene = SceneMesh.assemble([model, plane(size=size, cells=options.cells, albedo=(0.7, 0.7, 0.7))])
-    more = {"spacing": "0", "error_receivers": str(options.receivers), "error_paths": "2048"}
+    more = {"spacing": "0", "error_receivers": str(options.receivers), "error_paths": "16384"}
     plain = make_settings(options.preset, more)
     automatic = replace(plain, distant_basis="auto", encoder="auto")
     rows = []
