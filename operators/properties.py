@@ -250,8 +250,8 @@ class PRTSettings(bpy.types.PropertyGroup):
     )
     glossy_window: BoolProperty(
         name="Soften Sharp Ones", default=PRESETS["standard"].glossy_window,
-        description="Highlights sharper than the order of the light reflect a softer light. Buys highlights without "
-                    "dark rings, costs some of their sharpness and no time",
+        description="Highlights sharper than the light's order, or with a cubemap than their functions, reflect a "
+                    "softer light. Buys highlights without dark rings, costs some of their sharpness and no time",
     )
     subsurface: BoolProperty(
         name="Translucency", default=PRESETS["standard"].subsurface,

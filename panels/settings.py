@@ -59,9 +59,7 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
         shiny.prop(settings, "glossy_albedo")
-        window = shiny.column()
-        window.active = settings.distant_basis == "sh"  # texels do not ring
-        window.prop(settings, "glossy_window")
+        shiny.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
 
 

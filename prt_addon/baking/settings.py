@@ -46,7 +46,8 @@ class BakeSettings:
         diffuse light is drawn, metals are black. Each row costs as much as the whole diffuse transfer.
     glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
         most); below, its light stays in the diffuse layer.
-    glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
+    glossy_window: whether highlights sharper than the light's order (with a cubemap, than their rows) reflect a softer
+        light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
     distant_basis: what World and Suns are baked in. "sh": spherical harmonics of `order`. "cubemap": the texels of a
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
