@@ -172,9 +172,9 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "the surfaces that lamps shine on. Costs some drawing while on, nothing while off",
     )
     lamps_by_directions: BoolProperty(
-        name="Lamps by Nearest Directions", update=_light_changed, default=False,
-        description="Point, Spot and Area lamps light bakes made without local lights, as light from where they are. "
-                    "Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, at 1.5 "
+        name="Lamps from Afar", update=_light_changed, default=False,
+        description="Point, Spot and Area lamps light bakes made without local lights, by the directions nearest to "
+                    "them. Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, at 1.5 "
                     "radii 14 % off beside a ground. Costs some milliseconds a lamp",
     )
     window: BoolProperty(

@@ -31,8 +31,9 @@ from .plan import make_plan
 from .settings import AUTO, EIGENTRANSPORT, HIGHEST_ORDER, BakeSettings
 from .surfaces import plan_surfaces
 
-# Whether cubemap columns hold highlights and light through bodies, too. Until they do, scenes with these get harmonics.
-CUBEMAP_HOLDS_HIGHLIGHTS = False
+# What takes more than this many times as long as harmonics of the preset's order is only baked where it is chosen by
+# hand: texels in the rows of highlights take minutes to hours, and gigabytes of disk.
+MOST_TIMES = 10.0
 # Orders below are not chosen, however soft the light is: they cost little and hold the irradiance of any later light.
 LEAST_ORDER = 3
 VECTORS = (48, 96, 192)
@@ -106,15 +107,17 @@ def choose_basis(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight
     if light is None or light.is_black:
         light = stand_in_light()
     probe = probe_light(scene, tracer, light, not is_lone_convex(scene), settings.seed)
-    barred = "" if CUBEMAP_HOLDS_HIGHLIGHTS else _what_needs_harmonics(scene, settings)
-    found = [_costed(scene, candidate, light) for candidate in _candidates(settings, clustered, probe)]
-    chosen = _best(found, settings, bool(barred))
+    surfaces = plan_surfaces(scene, settings)
+    diffuse = not (surfaces.glossy_points(scene) | surfaces.translucent_points(scene)).any()
+    found = [_costed(scene, candidate, light) for candidate in _candidates(settings, clustered, probe, diffuse)]
+    limit = _most_seconds(found, settings)
+    chosen = _best([candidate for candidate in found if candidate.seconds <= limit], settings.light_error)
     facts = {"asked": {"distant_basis": settings.distant_basis, "encoder": settings.encoder,
                        "light_error": settings.light_error},
              "chosen": chosen.entry(), "candidates": [candidate.entry() for candidate in found],
-             "light": light.description, "needs_harmonics": barred,
+             "light": light.description, "most_seconds": limit if math.isfinite(limit) else None,
              "probe": {"receivers": probe.receivers, "rays": probe.rays, "seconds": time.perf_counter() - started}}
-    line = _line(chosen, found, settings, barred)
+    line = _line(chosen, found, settings.light_error)
     return chosen.settings, BasisChoice(line, {"line": line, **facts})
 
 
@@ -125,21 +128,9 @@ def _clusters(settings: BakeSettings) -> str:
     return "adaptive" if 0.0 < settings.compression_error <= FINE else "iterative"
 
 
-def _what_needs_harmonics(scene: SceneMesh, settings: BakeSettings) -> str:
-    """What of the scene a cubemap can't hold, with the first material that has it; "" for nothing."""
-    if settings.distant_basis != AUTO:
-        return ""  # the artist chose it all the same
-    surfaces = plan_surfaces(scene, settings)
-    for what, points in (("highlights", surfaces.glossy_points(scene)),
-                         ("light through bodies", surfaces.translucent_points(scene))):
-        if points.any():
-            first = scene.materials[int(scene.material[int(np.argmax(points))])].name
-            return f"{what} of {first}" if first else what
-    return ""
-
-
-def _candidates(settings: BakeSettings, clustered: BakeSettings, probe: LightProbe) -> Iterable[Candidate]:
-    """All that the settings leave to choose from."""
+def _candidates(settings: BakeSettings, clustered: BakeSettings, probe: LightProbe, diffuse: bool,
+                ) -> Iterable[Candidate]:
+    """All that the settings leave to choose from. diffuse: whether the scene has nothing else."""
     if settings.distant_basis == AUTO:
         # Eigentransport of few columns is these columns again: harmonics are always in clusters unless asked otherwise.
         for order in range(LEAST_ORDER, HIGHEST_ORDER + 1):
@@ -152,7 +143,7 @@ def _candidates(settings: BakeSettings, clustered: BakeSettings, probe: LightPro
             yield Candidate(taken, lost, clusters_error(probe, taken.clusters, taken.vectors))
         if settings.encoder == EIGENTRANSPORT:
             yield Candidate(taken, lost, vectors_error(probe, taken.vectors))
-        elif settings.encoder == AUTO and not settings.local_light:  # columns of lamps have clusters
+        elif settings.encoder == AUTO and diffuse and not settings.local_light:  # rows and lamps have clusters
             for vectors in VECTORS:
                 yield Candidate(replace(taken, encoder=EIGENTRANSPORT, vectors=vectors), lost,
                                 vectors_error(probe, vectors))
@@ -175,34 +166,38 @@ def _costed(scene: SceneMesh, candidate: Candidate, light: ReferenceLight) -> Ca
     return replace(candidate, stored_bytes=plan.stored_bytes, seconds=sum(plan.seconds.values()))
 
 
-def _best(found: list[Candidate], settings: BakeSettings, harmonics_only: bool) -> Candidate:
-    """The cheapest that keeps the asked error, else the cheapest near the least error; where only harmonics will do and
-    none keeps it, those of the settings' order, since highlights cost time and data with every column."""
-    if harmonics_only:
-        found = [candidate for candidate in found if candidate.settings.distant_basis == "sh"]
-    limit, least = settings.light_error, min(candidate.error for candidate in found)
-    if least > limit:
-        if harmonics_only:
-            return min(found, key=lambda candidate: abs(candidate.settings.order - settings.order))
-        limit = NEAR_LEAST * least
-    fitting = [candidate for candidate in found if candidate.error <= limit]
-    return min(fitting, key=lambda candidate: candidate.stored_bytes * candidate.seconds)
+def _most_seconds(found: list[Candidate], settings: BakeSettings) -> float:
+    """How long a choice may take."""
+    orders = [candidate for candidate in found if candidate.settings.distant_basis == "sh"]
+    if not orders:
+        return math.inf
+    return MOST_TIMES * min(orders, key=lambda candidate: abs(candidate.settings.order - settings.order)).seconds
 
 
-def _line(chosen: Candidate, found: list[Candidate], settings: BakeSettings, barred: str) -> str:
-    """The choice and its reason."""
-    asked = percent(settings.light_error)
-    text = f"Sky by {chosen.name}"
-    if barred:
-        text += f", because {barred} {'need' if barred.startswith('highlights') else 'needs'} harmonics"
-    text += f": about {percent(chosen.error)} of the light's shadows lost, "
-    text += f"{asked} asked" if chosen.error <= settings.light_error else f"more than the {asked} asked"
-    others = [c for c in found if c.settings.distant_basis != chosen.settings.distant_basis]
-    if not others:
+def _cost(candidate: Candidate) -> float:
+    return candidate.stored_bytes * candidate.seconds
+
+
+def _best(found: list[Candidate], asked: float) -> Candidate:
+    """The cheapest that keeps the asked error, else the cheapest near the least error."""
+    limit = max(asked, NEAR_LEAST * min(candidate.error for candidate in found)) \
+        if all(candidate.error > asked for candidate in found) else asked
+    return min((candidate for candidate in found if candidate.error <= limit), key=_cost)
+
+
+def _line(chosen: Candidate, found: list[Candidate], asked: float) -> str:
+    """The choice and its reason: what the other kind of basis would lose, or what it would cost to keep the error."""
+    text = f"Sky by {chosen.name}: about {percent(chosen.error)} of the light's shadows lost, "
+    text += f"{percent(asked)} asked" if chosen.error <= asked else f"more than the {percent(asked)} asked"
+    if chosen.error > asked:
+        dearer = [candidate for candidate in found if candidate.error < chosen.error and candidate != chosen]
+        keeping = [candidate for candidate in dearer if candidate.error <= asked]
+        if dearer:
+            other = min(keeping, key=_cost) if keeping else min(dearer, key=lambda candidate: candidate.error)
+            text += f"; {other.name} would lose {percent(other.error)} and take {other.seconds / chosen.seconds:.2g}" \
+                    " times as long"
         return text
-    other = min(others, key=lambda candidate: candidate.error)
-    if chosen.settings.distant_basis == "cubemap" and other.error > settings.light_error:
-        return f"{text}; {other.name} would lose {percent(other.error)}"
-    if chosen.settings.distant_basis == "sh" and chosen.error > settings.light_error:
-        return f"{text}; {other.name} would lose {percent(other.error)}"
+    orders = [candidate.error for candidate in found if candidate.settings.distant_basis == "sh"]
+    if chosen.settings.distant_basis == "cubemap" and orders and min(orders) > asked:
+        text += f"; spherical harmonics of order {HIGHEST_ORDER} would lose {percent(orders[-1])}"
     return text

@@ -54,7 +54,7 @@ class BakeSettings:
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
         harmonics blur them. Costs memory and time with the texels' number, highlights with that of their rows too.
         "auto": the order, or the cubemap, that keeps light_error under the scene's present light for least
-        (basis_choice.py); half a million rays find out. A later light that is sharper is shown blurred.
+        (basis_choice.py); a million rays find out. A later light that is sharper is shown blurred.
     light_error: relative RMS of shadowed irradiance that may be lost, with what an automatic choice can't hold of the
         light. Order 5 loses 2 to 5 % under most HDRIs, 10 to 30 % under a hard sun.
     memory_budget: GB of transfer kept in memory while a cubemap is baked; what is more goes to a file; 0 = no limit.

@@ -98,13 +98,19 @@ def test_clusters_are_found_as_presets_find_them(scene, goal, method):
     assert settings.encoder == method
 
 
-def test_highlights_get_harmonics_and_a_line_that_names_them():
+def test_highlights_are_not_baked_at_any_price():
+    """Texels in rows of highlights cost many times what harmonics do: they are not taken, and the line says so."""
     scene = still_life(metal=True)
     settings, choice = chosen(scene, light(0.0, 3.0), light_error="0.02")
-    assert (settings.distant_basis, settings.order) == ("sh", 5)
-    assert "because highlights of Gold need harmonics" in choice.line and "more than the 2.0 % asked" in choice.line
-    settings, choice = chosen(scene, light(0.0, 3.0), light_error="0.02", glossy_rows="0")
-    assert settings.distant_basis == "cubemap" and "because" not in choice.line
+    found, candidates = choice.facts["chosen"], choice.facts["candidates"]
+    assert found["seconds"] <= choice.facts["most_seconds"] < max(c["seconds"] for c in candidates)
+    usual = next(c for c in candidates if c.get("order") == 5)["seconds"]
+    assert choice.facts["most_seconds"] == pytest.approx(basis_choice.MOST_TIMES * usual)
+    assert "more than the 2.0 % asked; a cubemap of 32 texels in clusters would lose" in choice.line
+    assert choice.line.endswith("times as long") and "eigentransport" not in {c["encoder"] for c in candidates}
+    without, _ = chosen(scene, light(0.0, 3.0), light_error="0.02", glossy_rows="0")
+    assert without.distant_basis == "cubemap" and without.cubemap_size > settings.cubemap_size * (
+        settings.distant_basis == "cubemap")
 
 
 def test_columns_of_lamps_keep_clusters(scene):
