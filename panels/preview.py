@@ -34,6 +34,8 @@ class PRT_PT_preview(Sidebar, bpy.types.Panel):
         row.prop(context.scene.prt, "show_cloud")
         for line in session.preview_message.splitlines():
             wrapped(layout, context, line, "ERROR" if any(part in line for part in LOUD) else "INFO")
+        if session.live_materials:
+            wrapped(layout, context, session.live_materials, "MATERIAL")
         for line in session.viewport_message.splitlines():
             wrapped(layout, context, line, "INFO")
         layout.operator("prt.relight", icon="GROUP_VCOL")

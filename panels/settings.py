@@ -45,6 +45,7 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
             distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")
+        self.layout.operator("prt.measure_tracing", icon="SORTTIME")
 
 
 class PRT_PT_highlights(_Expert, bpy.types.Panel):
@@ -63,6 +64,9 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
         window.active = settings.distant_basis == "sh"  # texels do not ring
         window.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
+        lamps = column.column()
+        lamps.active = settings.lighting != "environment"
+        lamps.prop(settings, "subsurface_links")
 
 
 class PRT_PT_local_lights(_Expert, bpy.types.Panel):

@@ -13,6 +13,7 @@ from ..scene.scene_mesh import SceneMesh
 from ..transport.column_arrays import COLUMNS_AT_ONCE
 from ..transport.incident_light import NUMBERS
 from ..transport.interreflection import SLOW_RATIO
+from ..transport.live_operator import BYTES_PER_ENTRY
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .distant_basis import array_budget, distant_basis
@@ -170,6 +171,8 @@ def _shapes(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
 def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan) -> int:
     """Bytes in the .blend file: cluster, weights and colour of each receiver, and the bases."""
     per_receiver = 4 * (1 + 4 * -(-settings.vectors // 4) + 4)
+    if settings.live_editing:
+        per_receiver += BYTES_PER_ENTRY * settings.live_entries
     return sum(count * per_receiver
                + 4 * most_clusters(settings, count, shape) * (settings.vectors + 1) * math.prod(shape)
                for count, shape in _shapes(scene, settings, needs, surfaces))

@@ -8,7 +8,7 @@ later run of the same job starts after the last one.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
 from dataclasses import dataclass, field, fields, replace
@@ -57,6 +57,8 @@ from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
 from .lit_highlights import LitHighlights
+from .live_editing import kept_factors, with_live_editing
+from .live_links import with_subsurface_links
 from .local_budget import local_budget
 from .local_highlight_budget import local_highlight_budget
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
@@ -117,17 +119,19 @@ Steps = Generator[Progress, None, Any]
 
 def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
          light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
-         regions: NDArray[np.float64] | None = None) -> Generator[Progress, None, BakeResult]:
+         regions: NDArray[np.float64] | None = None,
+         make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress, None, BakeResult]:
     """Yield progress and return the result.
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
-    scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    scene's free space). make_tracer: of points, triangles, a number of threads and the surface of texels (None:
+    none). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
     settings, choice = choose_basis(scene, settings, light)
     settings = transport_settings(settings)
     regions = np.empty((0, 4, 4)) if regions is None else regions
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice).run())
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice, make_tracer).run())
 
 
 def transport_settings(settings: BakeSettings) -> BakeSettings:
@@ -151,6 +155,7 @@ class _Bake:
     digests: dict[str, str]
     regions: NDArray[np.float64]
     choice: BasisChoice | None = None
+    make_tracer: Callable[..., Tracer] = Tracer
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
@@ -192,6 +197,7 @@ class _Bake:
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
+        self.kept_factors = kept_factors(gathered, self.albedo, self.basis.white(transfer), self.settings)
         glossy, subsurface = None, []
         if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
@@ -292,7 +298,7 @@ class _Bake:
 
     def _prepare(self) -> None:
         settings = self.settings
-        self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
+        self.tracer = self.make_tracer(*self.scene.shape, settings.threads, self.scene.traced)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
@@ -792,6 +798,7 @@ class _Bake:
                            time.perf_counter() - self.started)
         report["basis"] = self.basis.words if self.settings.distant_light else ""
         report["choice"] = None if self.choice is None else self.choice.facts
+        report["tracer"] = self.tracer.facts
         if self.local is not None:
             report["local"] = self.local.facts
             report["local_errors"] = self.local_errors
@@ -819,6 +826,11 @@ class _Bake:
         if self.local is not None:
             objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
                        for target in self.targets}
+            objects = {target.name: with_subsurface_links(objects[target.name], self.scene, target,
+                                                          self.settings.subsurface_links, self.tracer.threads)
+                       for target in self.targets}
+        objects, report["live_editing"] = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces,
+                                                            self.albedo, self.buried)
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:
