@@ -174,8 +174,8 @@ class PRTSettings(bpy.types.PropertyGroup):
     lamps_by_directions: BoolProperty(
         name="Lamps from Afar", update=_light_changed, default=False,
         description="Point, Spot and Area lamps light bakes made without local lights, by the directions nearest to "
-                    "them. Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, at 1.5 "
-                    "radii 14 % off beside a ground. Costs some milliseconds a lamp",
+                    "them. Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, "
+                    "at 1.5 radii 14 % off beside a ground. Costs some milliseconds a lamp",
     )
     window: BoolProperty(
         name="Soften Ringing", update=_light_changed, default=False,
