@@ -47,7 +47,6 @@ from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
-from .distant_lamps import DistantLamps
 from .live_materials import LiveMaterials
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
@@ -116,7 +115,6 @@ class Live:
     message: str = ""
     light: DistantLight | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
-    far_lamps: DistantLamps = field(default_factory=DistantLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
     lamps_time: float = 0.0
@@ -330,7 +328,6 @@ def _read_bakes() -> None:
     bakes = _bakes_here()
     _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known(bakes)
     _live.lamps.forget_geometry()
-    _live.far_lamps.forget_geometry()
     layer = {found.name_full for found in bpy.context.view_layer.objects}
     for name, (found, owner, local) in bakes.items():
         line = Line(name)
@@ -436,7 +433,6 @@ def _read_stale() -> None:
     if around != _live.around:
         _live.around = around
         _live.lamps.forget_geometry()
-        _live.far_lamps.forget_geometry()
         _live.materials.forget_geometry()
         _live.materials_dirty = True
     bakes, changed = _bakes_here(), False
@@ -511,10 +507,10 @@ def _read_far_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None
     bakes = {name: shown.baked for name, shown in _live.shown.items() if shown.baked.cloud is None}
     if settings.lamps_by_directions and bakes:
         owners = {name: _live.shown[name].owner for name in bakes}
-        outside = _live.far_lamps.step(bakes, depsgraph, warnings, owners)
+        outside = _live.lamps.far.step(bakes, depsgraph, warnings, owners)
     for name, baked in bakes.items():
         shown = _live.shown[name]
-        direct = _live.far_lamps.direct(name, baked, outside, settings.window, shown.moved)
+        direct = _live.lamps.far.direct(name, baked, outside, settings.window, shown.moved)
         if direct is not shown.direct:
             shown.direct = direct
             viewport.redraw()

@@ -33,6 +33,7 @@ from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
 from ..prt_addon.tracing.tracer import Tracer
+from .distant_lamps import DistantLamps
 
 Move = NDArray[np.float64] | None
 Moves = Mapping[str, NDArray[np.float64]]
@@ -52,6 +53,7 @@ class SceneLamps:
     _direct: dict[tuple[str, bytes], DirectLight] = field(default_factory=dict)
     _scattering: dict[str, tuple[BakedTransfer, LiveScattering]] = field(default_factory=dict)  # by object
     _keys: dict[int, tuple[LocalBasis, str]] = field(default_factory=dict)  # by the cloud's identity
+    far: DistantLamps = field(default_factory=DistantLamps)  # of bakes without columns for lamps
 
     def forget_geometry(self) -> None:
         """Something moved or changed its shape: shadows are to be found anew."""
@@ -60,6 +62,7 @@ class SceneLamps:
         self._clouds.clear()
         self._direct.clear()
         self._keys.clear()
+        self.far.forget_geometry()
 
     def step(self, baked: dict[str, BakedTransfer], depsgraph: bpy.types.Depsgraph,
              warnings: list[str], seconds: float = AT_ONCE, moves: Moves | None = None,

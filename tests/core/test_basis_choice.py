@@ -20,6 +20,7 @@ from prt_addon.reporting.report_file import problem_of
 from prt_addon.reporting.summary import summary
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.scene.surface_material import SurfaceMaterial
+from prt_addon.scene.texel_receivers import TexelChoice
 from tests.core.shapes import plane, sphere
 
 AUTO = {"distant_basis": "auto", "encoder": "auto", "threads": "1"}
@@ -163,3 +164,13 @@ def test_settings_that_are_no_choice_are_refused():
     for wrong in ({"light_error": "0"}, {"light_error": "2"}, {"encoder": "automatic"}):
         with pytest.raises(BadArguments):
             make_settings("standard", wrong)
+
+
+def test_texels_of_an_atlas_are_asked_as_vertices_are(scene):
+    """Receivers that are texels see the true surface, so that they tell about the same of the light."""
+    meshes = [plane(size=4.0), sphere(centre=(0, 0, 0.9), radius=0.8, subdivisions=3)]
+    texels = SceneMesh.assemble(meshes, 1 / 40, None, TexelChoice("texels"))
+    _, ours = chosen(texels, light(0.3, 3.0))
+    _, theirs = chosen(scene, light(0.3, 3.0))
+    for found, other in zip(ours.facts["candidates"], theirs.facts["candidates"], strict=True):
+        assert 0.5 < found["basis_error"] / other["basis_error"] < 2.0
