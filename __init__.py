@@ -32,6 +32,7 @@ from .panels.bake import PRT_PT_bake
 from .panels.check import PRT_PT_check
 from .panels.lamp import PRT_PT_lamp
 from .panels.light_presets import PRT_PT_light_animation, PRT_PT_light_presets, PRT_PT_lights
+from .panels.live_materials import PRT_PT_live_materials
 from .panels.preview import PRT_PT_preview
 from .panels.properties_editor import PRT_PT_object, PRT_PT_world
 from .panels.results import PRT_PT_last_bake, PRT_PT_results
@@ -65,6 +66,7 @@ CLASSES = (
     PRT_PT_highlights,
     PRT_PT_local_lights,
     PRT_PT_compression,
+    PRT_PT_live_materials,
     PRT_PT_preview,
     PRT_PT_light_presets,
     PRT_PT_lights,

@@ -57,11 +57,11 @@ def tracer_maker(device: Any) -> Callable[..., Any]:
     """Makes what traces a bake: on the device beside Embree, or by Embree alone where the device can't hold it."""
     errors, mixed = part("prt_addon.errors"), part("prt_addon.tracing.mixed_tracer")
 
-    def make(points: Any, triangles: Any, threads: int) -> Any:
+    def make(points: Any, triangles: Any, threads: int, surface: Any = None) -> Any:
         try:
-            return mixed.MixedTracer(points, triangles, threads, device)
+            return mixed.MixedTracer(points, triangles, threads, device, surface)
         except errors.PRTError:
-            return part("prt_addon.tracing.tracer").Tracer(points, triangles, threads)
+            return part("prt_addon.tracing.tracer").Tracer(points, triangles, threads, surface)
     return make
 
 

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
+from ..prt_addon.baking.basis_choice import choose_basis
 from ..prt_addon.baking.claims import Claim, discard_if_free
+from ..prt_addon.baking.distant_basis import distant_basis
 from ..prt_addon.baking.local_lights import fit_to_lamps
 from ..prt_addon.baking.memory import memory_warning
 from ..prt_addon.baking.plan import make_plan
@@ -82,7 +84,8 @@ def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: 
     lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
     centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
     mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings, selected), settings.spacing,
-                              np.concatenate([lamps, centres]) if settings.local_light else None)
+                              np.concatenate([lamps, centres]) if settings.local_light else None,
+                              settings.texels, settings.live_editing)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 
@@ -91,7 +94,12 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
     """What a bake of the scene would need, leave out and cost, as JSON-able values."""
     scene = read_scene(depsgraph, settings, targets)
     settings, lost = fit_to_lamps(settings, read_local_lights(depsgraph, []))
-    plan = make_plan(scene, transport_settings(settings), reference_light(depsgraph))
+    light = reference_light(depsgraph)
+    # In Blender's own process nothing starts threads (design/architecture.md).
+    settings, choice = choose_basis(scene, settings, light, threads=1)
+    settings = transport_settings(settings)
+    plan = make_plan(scene, settings, light)
+    basis = distant_basis(settings, plan.needs.order) if settings.distant_light else None
     try:
         too_much = memory_warning(plan, settings)
     except BadScene as error:  # an analysis tells it and goes on
@@ -102,7 +110,9 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
         "receivers": plan.receivers,
         "triangles": len(scene.triangles),
         "needs": {"shadow_rays": plan.needs.shadow_rays, "bounces": plan.needs.bounces,
-                  "channels": plan.needs.channels, "order": plan.needs.order},
+                  "channels": plan.needs.channels, **(basis.facts if basis else {})},
+        "basis": basis.words if basis else "",
+        "choice": None if choice is None else choice.facts,
         "left_out": [*(asdict(item) for item in plan.needs.left_out), *left_out(settings.threads)],
         "tracer": tracing_choice(settings.threads).why,
         "hints": list(plan.needs.hints),
@@ -124,7 +134,8 @@ def analysis_lines(analysis: dict[str, Any]) -> list[str]:
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
     told = [line for line in analysis["warnings"] if line.startswith("Bake: ")]  # of memory: first, as it may end it
     rest = [line for line in analysis["warnings"] if line not in told]
-    return lines[:1] + told + lines[1:] + analysis["hints"] + rest
+    basis = [analysis["choice"]["line"]] if analysis["choice"] else [analysis["basis"]] * bool(analysis["basis"])
+    return lines[:1] + told + basis + lines[1:] + analysis["hints"] + rest
 
 
 @dataclass
@@ -162,7 +173,8 @@ class BakeSession:
         names = [o.name for o in scene.objects if o.is_target]
         targets_found = find_objects(names, depsgraph.scene)
         _check_storable(targets_found)
-        digests = {name: fingerprint(found, depsgraph) for name, found in zip(names, targets_found, strict=True)}
+        digests = {name: fingerprint(found, depsgraph, settings.live_editing)
+                   for name, found in zip(names, targets_found, strict=True)}
         geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
         folder = jobs_folder()
         _drop_forgotten(folder)
@@ -185,7 +197,7 @@ class BakeSession:
         """An interrupted bake whose result is there, if the scene is as it was when it was read; else None."""
         found = {o.name_full: o for o in depsgraph.scene.objects}
         if not jobs.job_summary(folder)["complete"] or surroundings(depsgraph) != record.surroundings or any(
-                name not in found or fingerprint(found[name], depsgraph) != digest
+                name not in found or fingerprint(found[name], depsgraph, "live_materials" in digest) != digest
                 for name, digest in record.digests.items()):
             return None
         claim = Claim.take(folder)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.texel_surface import TracedSurface
 from .hits import Hits
 from .ray_engine import MOST_PAIRS, RayDevice, RayEngine
 from .tracer import Result, Tracer
@@ -31,8 +32,8 @@ class MixedTracer(Tracer):
     """
 
     def __init__(self, points: NDArray[np.float64], triangles: NDArray[np.int32], threads: int,
-                 device: RayDevice) -> None:
-        super().__init__(points, triangles, threads)
+                 device: RayDevice, surface: TracedSurface | None = None) -> None:
+        super().__init__(points, triangles, threads, surface)
         self.device_name = device.name
         self.gpu_rays = 0
         self._engine = RayEngine(device, self.to_tracing_space(points), np.asarray(triangles, np.int32))
@@ -66,7 +67,7 @@ class MixedTracer(Tracer):
         if not self.on_device(len(origins)):
             return super().nearest(origins, directions)
         self.gpu_rays += len(origins)
-        return self._engine.nearest(origins, directions)
+        return self._named(self._engine.nearest(origins, directions))
 
     def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
                        asked: NDArray[np.bool_]) -> NDArray[np.bool_]:

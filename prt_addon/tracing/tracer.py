@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from ..errors import PRTError
 from ..scene.object_mesh import bounding_diagonal
+from ..scene.scene_mesh import SceneMesh
+from ..scene.texel_surface import TracedSurface
 from .hits import Hits
 
 Result = TypeVar("Result")
@@ -28,10 +30,12 @@ class Tracer:
     """Embree over one triangle soup.
 
     points: (p, 3) float64 world space; triangles: (t, 3) int32; threads: workers of `map_in_order` (0 = one for each
-    core that this process may use). `rays` counts every ray traced.
+    core that this process may use); surface: what triangles stand for where receivers are texels. `rays` counts every
+    ray traced.
     """
 
-    def __init__(self, points: NDArray[np.float64], triangles: NDArray[np.int32], threads: int = 0) -> None:
+    def __init__(self, points: NDArray[np.float64], triangles: NDArray[np.int32], threads: int = 0,
+                 surface: TracedSurface | None = None) -> None:
         used = points[np.unique(triangles)] if len(triangles) else points
         self.diagonal = bounding_diagonal([used]) or 1.0
         self._centre = 0.5 * (used.min(axis=0) + used.max(axis=0)) if len(used) else np.zeros(3)
@@ -39,6 +43,12 @@ class Tracer:
         self.threads = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else
                                       range(os.cpu_count() or 1))
         self.rays = 0
+        self.surface = surface
+
+    @staticmethod
+    def of_scene(scene: SceneMesh, threads: int = 0) -> Tracer:
+        """Over a scene's true surface; hits are named by the scene's own triangles, which join its points."""
+        return Tracer(*scene.shape, threads, scene.traced)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -66,7 +76,14 @@ class Tracer:
         found = self._scene.run(origins, directions, query="INTERSECT", output=1)
         # Embree's geometric normal follows the winding, so a ray against it meets the front.
         front = np.sum(found["Ng"] * directions, axis=1) < 0.0
-        return Hits(found["primID"], found["u"], found["v"], front, found["tfar"])
+        return self._named(Hits(found["primID"], found["u"], found["v"], front, found["tfar"]))
+
+    def _named(self, hits: Hits) -> Hits:
+        """Hits of the traced surface, by the triangles that join the scene's points."""
+        if self.surface is None:
+            return hits
+        traced = hits.triangle, hits.u, hits.v
+        return Hits(*self.surface.named(*traced), hits.front, hits.distance, traced)
 
     def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
                        asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
