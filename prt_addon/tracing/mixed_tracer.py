@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..scene.texel_surface import TracedSurface
 from .hits import Hits
-from .ray_engine import RayDevice, RayEngine
+from .ray_engine import MOST_PAIRS, RayDevice, RayEngine
 from .tracer import Result, Tracer
 
 LEAST_RAYS = 2048  # fewer are traced by Embree before a dispatch has begun
@@ -68,6 +68,32 @@ class MixedTracer(Tracer):
             return super().nearest(origins, directions)
         self.gpu_rays += len(origins)
         return self._named(self._engine.nearest(origins, directions))
+
+    def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                       asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """See `Tracer.occluded_where`."""
+        if not self._where_on_device(asked):
+            return super().occluded_where(origins, directions, asked)
+        return self._engine.occluded_where(origins, directions, asked)
+
+    def nearest_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32], asked: NDArray[np.bool_],
+                      ) -> tuple[NDArray[np.int64], NDArray[np.int64], Hits]:
+        """See `Tracer.nearest_where`."""
+        if not self._where_on_device(asked):
+            return super().nearest_where(origins, directions, asked)
+        codes = np.flatnonzero(asked)
+        which, row = np.divmod(codes, len(origins))
+        return which, row, self._engine.nearest_pairs(origins, directions, codes)
+
+    def _where_on_device(self, asked: NDArray[np.bool_]) -> bool:
+        """Whether the device traces what is asked for, which is counted then."""
+        if asked.size > MOST_PAIRS or not self.on_device(asked.size):
+            return False
+        rays = int(np.count_nonzero(asked))
+        if not self.on_device(rays):
+            return False
+        self.gpu_rays += rays
+        return True
 
     def map_in_order(self, work: Callable[[Any], Result], items: Iterable[Any]) -> Iterator[tuple[Any, Result]]:
         """See `Tracer.map_in_order`; while tasks are left, this thread does some itself."""

@@ -162,6 +162,24 @@ def test_nothing_and_next_to_nothing(device):
     assert_agree(single.nearest(origins, directions), tracer.nearest(origins, directions))
 
 
+def test_pairs_of_origins_and_directions_are_the_rays_one_by_one(device):
+    engine, tracer, points = pair(device, *ball_field())
+    origins, directions = field_rays(points)
+    origins, directions = origins[:900], directions[:7]
+    asked = np.random.default_rng(3).random((7, 900)) < 0.6
+    codes = np.flatnonzero(asked)
+    which, row, theirs = tracer.nearest_where(origins, directions, asked)
+    assert np.array_equal(which * 900 + row, codes)
+    assert_agree(engine.nearest_pairs(origins, directions, codes), theirs, 2)
+    hit = tracer.occluded_where(origins, directions, asked)
+    assert not hit[~asked].any() and np.array_equal(hit[asked], theirs.triangle >= 0)
+    assert np.array_equal(engine.occluded_where(origins, directions, asked), hit)
+    assert not engine.occluded_where(origins, directions, np.zeros_like(asked)).any()
+    assert len(engine.nearest_pairs(origins, directions, codes[:0]).triangle) == 0
+    with pytest.raises(ValueError, match="too many"):
+        engine.nearest_pairs(np.zeros((1 << 16, 3), np.float32), np.ones((1 << 9, 3), np.float32), codes)
+
+
 def test_bad_rays_and_scenes_are_refused(device):
     engine, _, _ = pair(device, *closed_room(2))
     origins, directions = sphere_rays(10, 7)
@@ -206,8 +224,8 @@ def test_both_sides_share_the_work_and_keep_its_order(device):
         wheres.append(threading.get_ident())
         part = slice(4096 * k, 4096 * (k + 1))
         return mixed.occluded(origins[part], directions[:1])
-    found = list(mixed.map_in_order(work, range(16)))
-    assert [k for k, _ in found] == list(range(16))
+    found = list(mixed.map_in_order(work, range(8)))
+    assert [k for k, _ in found] == list(range(8))
     assert (np.concatenate([hit for _, hit in found]) != alone.occluded(origins, directions[:1])).sum() <= 2
     assert len(set(wheres)) == 2 and 0 < mixed.gpu_rays < len(origins)
     assert mixed.gpu_rays == 4096 * wheres.count(threading.get_ident())
@@ -238,7 +256,8 @@ def test_this_machine_measures_itself_and_chooses(device):
     tracer = Tracer(*ball_field(), 1)
 
     def embree(_points, _triangles):
-        return lambda origins, direction: tracer.occluded(tracer.to_tracing_space(origins), direction)
+        return lambda origins, directions: tracer.occluded_where(
+            tracer.to_tracing_space(origins), directions, np.ones((len(directions), len(origins)), bool))
     known = calibrate(device, embree, 1)
     assert known.device == device.name and min(known.fill, known.readback, known.upload, known.latency) > 0.0
     if "llvmpipe" in device.name:  # a software driver is no GPU
@@ -288,7 +307,7 @@ def test_a_bake_traced_on_the_gpu_is_the_bake_of_embree(device, tmp_path: Path, 
 
 def made_up(gpu_rays: float):
     from prt.prt_addon.tracing.ray_cost import Calibration
-    return Calibration("a driver", 1e9, 1e9, 1e9, 1e-4, 1e8, gpu_rays, gpu_rays, 1e7, 1)
+    return Calibration("a driver", 1e9, 1e9, 1e9, 1e-4, 1e-7, 1e8, gpu_rays, gpu_rays, 1e7, 1)
 
 
 def test_a_driver_that_falls_is_not_asked_again(tmp_path: Path, monkeypatch):
