@@ -17,7 +17,10 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
+from ..linear_algebra import sparse_multiply
+from ..transport.subsurface_links import Links
 from ..transport.surface_pyramid import SurfacePyramid
 from .exit_radiance import Baked, cluster_constants, exit_radiance
 from .subsurface_texels import unpacked_links
@@ -27,8 +30,6 @@ Single = NDArray[np.float32]
 CONSTANT = 0.5 / np.sqrt(np.pi)
 # Albedo below which a surface without view-dependent rows can't show what went through it.
 DARKEST = 1e-3
-# Texels gathered at once: what they read stays in the cache.
-BLOCK = 2048
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class LiveScattering:
         areas = np.zeros(self._points)
         areas[mine] = links.places[self.used, 3]
         self.pyramid = SurfacePyramid.of_places(self.receiver, baked.positions, baked.normals, areas, links.levels)
-        self._unpacked = unpacked_links(links.texels)
+        self._matrices: list[csr_array] = []
         self.row = 1 if baked.functions else 0
         self.factor = np.zeros((self._points, 3), np.float32)  # on what was scattered, per receiver
         self.factor[mine] = links.places[self.used, 1, None]
@@ -83,12 +84,13 @@ class LiveScattering:
         """Passes one and two: radiance (p, 3) that leaves each receiver for E / pi (p, 3) that enters; 0 where a
         receiver is not translucent."""
         means = self.pyramid.means(light)
-        moments, links = self.pyramid.moments(means), self._unpacked
+        if not self._matrices:  # not needed where a graphics card gathers
+            self._matrices = _matrices(unpacked_links(self.links.texels), len(means))
+        values = np.concatenate([means[:, None], self.pyramid.moments(means)], axis=1).reshape(-1, 3)
         result = np.zeros((self._points, 3), np.float32)
-        for start in range(0, len(self.used), BLOCK):
-            part = slice(start, start + BLOCK)
-            some = type(links)(links.node[part], links.factor[part], links.shift[part], links.bounded)
-            result[self.receiver[self.used[part]]] = some.gathered(means, moments)
+        for channel, matrix in enumerate(self._matrices):
+            light = np.ascontiguousarray(values[:, channel, None])
+            result[self.receiver[self.used], channel] = sparse_multiply(matrix, light)[:, 0]
         return result
 
     def added(self, direct: Single, bounced: Single | None) -> Single:
@@ -99,6 +101,17 @@ class LiveScattering:
         result[:, 0] -= self.through[:, None] * light
         result[:, self.row] += self.factor * self.scattered(light)
         return result
+
+
+def _matrices(links: Links, nodes: int) -> list[csr_array]:
+    """Per channel the links (r, K) as a matrix (r, 4 nodes): four numbers of each node, its mean and its moments."""
+    weights = np.concatenate([np.ones((*links.node.shape, 1), np.float32), links.shift], axis=2)
+    column = 4 * links.node[..., None] + np.arange(4, dtype=np.int32)
+    kept = (weights != 0.0) & links.factor.any(axis=2)[..., None]
+    starts = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))]).astype(np.int32)
+    indices = column[kept]
+    return [csr_array(((links.factor[..., channel, None] * weights)[kept], indices, starts),
+                      shape=(len(links.node), 4 * nodes)) for channel in range(3)]
 
 
 def bounced_light(baked: Baked, light: Single | None) -> Single | None:

@@ -73,7 +73,6 @@ class Links:
         if moments is not None:
             for axis in range(3):
                 light += self.shift[..., axis, None] * moments[self.node, axis]
-            np.maximum(light, 0.0, out=light)
         return np.sum(self.factor * light, axis=1)
 
     @property
