@@ -12,6 +12,7 @@ Distant light needs none of this: it went through the body when it was baked.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -69,6 +70,8 @@ class LiveScattering:
         areas[mine] = links.places[self.used, 3]
         self.pyramid = SurfacePyramid.of_places(self.receiver, baked.positions, baked.normals, areas, links.levels)
         self._matrices: list[csr_array] = []
+        # How long a change of light takes here and, once that was measured, on the graphics card (inf: it can't).
+        self.seconds, self.card_seconds = np.inf, None
         self.row = 1 if baked.functions else 0
         self.factor = np.zeros((self._points, 3), np.float32)  # on what was scattered, per receiver
         self.factor[mine] = links.places[self.used, 1, None]
@@ -96,11 +99,18 @@ class LiveScattering:
     def added(self, direct: Single, bounced: Single | None) -> Single:
         """Pass three: what is to be added to the exit radiance, (p, rows, 3), for the direct light of lamps (p, rows,
         3), with their bounced light (p, 3), which is in the diffuse row already, or None."""
+        started = time.perf_counter()
         light = direct[:, 0] if bounced is None else direct[:, 0] + bounced
         result = direct.copy()
         result[:, 0] -= self.through[:, None] * light
         result[:, self.row] += self.factor * self.scattered(light)
+        self.seconds = min(self.seconds, time.perf_counter() - started)
         return result
+
+    @property
+    def prefers_card(self) -> bool:
+        """Whether the graphics card was measured to be faster."""
+        return self.card_seconds is not None and self.card_seconds < self.seconds
 
 
 def _matrices(links: Links, nodes: int) -> list[csr_array]:
