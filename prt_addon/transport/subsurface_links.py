@@ -75,6 +75,10 @@ class Links:
                 light += self.shift[..., axis, None] * moments[self.node, axis]
         return np.sum(self.factor * light, axis=1)
 
+    def of(self, rows: NDArray[np.integer]) -> Links:
+        """The links of some receivers."""
+        return Links(self.node[rows], self.factor[rows], self.shift[rows], self.bounded)
+
     @property
     def sums(self) -> Single:
         """(r, 3) what each receiver gives under irradiance 1 everywhere."""
