@@ -21,6 +21,7 @@ from ..transport.column_arrays import COLUMNS_AT_ONCE, column_array, column_bloc
 from ..transport.cubemap_transfer import bounced_columns, cubemap_transfer
 from ..transport.interreflection import Interreflection
 from ..transport.receiver_set import ReceiverSet
+from ..transport.texel_visibility import TexelVisibility
 from .distant_basis import DistantBasis, array_budget
 from .settings import BakeSettings
 
@@ -38,10 +39,11 @@ def is_kept(transfer: Single, settings: BakeSettings) -> bool:
 
 
 def direct_cubemap(tracer: Tracer, receivers: ReceiverSet, basis: DistantBasis, settings: BakeSettings,
-                   shadow_rays: bool, folder: Path | None) -> Generator[float, None, Single]:
-    """Yield progress, return direct transfer (r, columns)."""
+                   shadow_rays: bool, folder: Path | None, plain: TexelVisibility | None = None,
+                   ) -> Generator[float, None, Single]:
+    """Yield progress, return direct transfer (r, columns). plain: collects what receivers with highlights see."""
     transfer = yield from cubemap_transfer(tracer, receivers, basis.cubemap, basis.samples(settings.directions),
-                                           shadow_rays, array_budget(settings), folder)
+                                           shadow_rays, array_budget(settings), folder, plain)
     return transfer.T
 
 

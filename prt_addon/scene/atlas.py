@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BadScene
+from .atlas_cells import AtlasCells
 from .charts import Charts, Double, extents, face_normals
 from .tangents import quiet_pole, smooth_tangents, tangent_frame
 from .unwrapping import SECONDS, make_charts
@@ -64,20 +65,13 @@ class Texels:
 
 
 @dataclass(frozen=True)
-class Atlas:
-    """places: (t, 3, 2) float64 of triangles' corners, in texels; chart: (t,) int64, -1 for triangles without area;
-    cells: (c, 4) int64 into texels; cell_key: (c,) int64 row * width + column of their lower left, ascending; fallback:
-    (t,) int64, a cell that each triangle touches (-1: none); texel: metres; method: of the charts."""
+class Atlas(AtlasCells):
+    """chart: (t,) int64, -1 for triangles without area; height: in texels; texel: metres; method: of the charts."""
 
-    width: int
     height: int
     texel: float
     texels: Texels
-    places: Double
     chart: NDArray[np.int64]
-    cells: NDArray[np.int64]
-    cell_key: NDArray[np.int64]
-    fallback: NDArray[np.int64]
     method: str
 
     @property
@@ -101,50 +95,6 @@ class Atlas:
         result = np.zeros((self.height, self.width, *values.shape[1:]), values.dtype)
         result[self.texels.row, self.texels.column] = values
         return result
-
-    def cells_at(self, triangle: NDArray[np.integer], u: NDArray[np.floating], v: NDArray[np.floating],
-                 ) -> tuple[NDArray[np.int64], Double]:
-        """The cell (k,) of places on triangles, and where in it (k, 2), 0..1. u, v: weights of corners 1 and 2."""
-        corners = self.places[triangle]
-        at = corners[:, 0] + u[:, None] * (corners[:, 1] - corners[:, 0]) + v[:, None] * (corners[:, 2] - corners[:, 0])
-        cell, part = self._found(at)
-        missing = cell < 0
-        if missing.any():  # on a rim, by rounding: a little towards the triangle's middle
-            cell[missing], part[missing] = self._found(at[missing] + 1e-3 * (corners[missing].mean(axis=1)
-                                                                             - at[missing]))
-            missing = np.flatnonzero(cell < 0)
-            cell[missing] = self.fallback[triangle[missing]]
-            key = self.cell_key[cell[missing]]
-            part[missing] = np.clip(at[missing] - np.stack([key % self.width, key // self.width], axis=1), 0.0, 1.0)
-        return cell, part
-
-    def _found(self, at: Double) -> tuple[NDArray[np.int64], Double]:
-        low = np.floor(at).astype(np.int64)
-        key = low[:, 1] * self.width + low[:, 0]
-        place = np.minimum(np.searchsorted(self.cell_key, key), len(self.cell_key) - 1)
-        return np.where(self.cell_key[place] == key, place, -1), at - low
-
-    def sample(self, values: NDArray[np.floating], triangle: NDArray[np.integer], u: NDArray[np.floating],
-               v: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Values (n, k) of texels at places on triangles, filtered bilinearly: (m, k). u, v: (m,) weights of corners
-        1 and 2."""
-        cell, part = self.cells_at(triangle, u, v)
-        x, y = part[:, 0], part[:, 1]
-        shares = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
-        return np.sum(values[self.cells[cell]] * shares[:, :, None], axis=1)
-
-    def cell_triangles(self) -> NDArray[np.int64]:
-        """(2 c, 3) texels of each cell's two triangles, one after the other: right of its diagonal, left of it."""
-        a, b, c, d = self.cells.T
-        return np.stack([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)], axis=1).reshape(-1, 3)
-
-    def on_cell_triangles(self, triangle: NDArray[np.integer], u: NDArray[np.floating], v: NDArray[np.floating],
-                          ) -> tuple[NDArray[np.int64], Double, Double]:
-        """The same places (k,) on `cell_triangles`: which one, and the weights of its corners 1 and 2."""
-        cell, part = self.cells_at(triangle, u, v)
-        x, y = part[:, 0], part[:, 1]
-        right = x >= y
-        return 2 * cell + ~right, np.where(right, x - y, x), np.where(right, y, y - x)
 
     @staticmethod
     def dilated(picture: NDArray[np.floating], mask: NDArray[np.bool_], rings: int) -> NDArray[np.floating]:
@@ -197,7 +147,7 @@ def make_atlas(name: str, points: Double, normals: Double, triangles: NDArray[np
     nearest = _nearest(places, owner, cells[cell_of.ravel()], texel_key, width)
     made = _texels(points, normals, tangents, triangles, charts, nearest, texel_key, width)
     made = _with_areas(made, cells, points, triangles, charts)
-    return Atlas(width, height, texel, made, places, charts.chart, cells, cell_key, fallback, charts.method)
+    return Atlas(width, places, cells, cell_key, fallback, height, texel, made, charts.chart, charts.method)
 
 
 def _texel_size(name: str, charts: Charts, texel: float, side: int, gutter: int, align: int) -> float:
