@@ -16,6 +16,7 @@ from ..transport.interreflection import SLOW_RATIO
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .distant_basis import array_budget, distant_basis
+from .sampling import dense_bytes, forecast_seconds, forecast_share, sampling_hints
 from .settings import EIGENTRANSPORT, BakeSettings
 from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
@@ -92,6 +93,7 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     if basis.cubemap and not all(material.is_diffuse for material in scene.materials):
         needs.hints.append("a cubemap's columns hold diffuse light only: highlights and light through bodies need"
                            " distant_basis=sh")
+    needs.hints += sampling_hints(settings)
     columns = distant_basis(settings, needs.order).columns
     values = receivers * columns * needs.channels
     glossy, translucent = int(surfaces.glossy_points(scene).sum()), int(surfaces.translucent_points(scene).sum())
@@ -99,8 +101,9 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
     if needs.bounces:
         rays["gather"] = gather
         seconds["gather"] = gather / GATHER_RAYS_PER_SECOND
-    rays["direct"] = shadow if needs.shadow_rays else 0
+    rays["direct"] = int(shadow * forecast_share(settings)) if needs.shadow_rays else 0
     seconds["direct"] = rays["direct"] / SHADOW_RAYS_PER_SECOND + 1e-8 * values
+    seconds["direct"] += forecast_seconds(settings, receivers, columns)
     if needs.bounces:
         seconds["interreflection"] = values * settings.gather_directions * 0.02 * SECONDS_PER_BOUNCED_VALUE + 0.05
     if glossy and settings.distant_light:
@@ -198,7 +201,8 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
         rows = 0
     local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions), share)
     shapes = _shapes(scene, settings, needs, surfaces, share)
-    stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
+    stages = [known + transfer + dense_bytes(settings, receivers, basis.columns),
+              known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
               known + second + copies * solved,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
               known + transfer + rows + local.kept + max(local.zone, second + local.solving),

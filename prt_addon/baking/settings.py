@@ -17,6 +17,7 @@ LAMP_BASES = ("surfaces", "cloud")
 MERGED_RESPONSES = ("arithmetic", "harmonic", "solution")
 MOST_CLOUD_LIGHTS = 4096
 DISTANT_BASES = ("sh", "cubemap")
+SAMPLINGS = ("automatic", "every", "sparse")
 EIGENTRANSPORT = "eigentransport"
 ENCODERS = (*METHODS, EIGENTRANSPORT)
 # Vectors of a cluster: more than this only where there is but one cluster.
@@ -51,6 +52,10 @@ class BakeSettings:
     distant_basis: what World and Suns are baked in. "sh": spherical harmonics of `order`. "cubemap": the texels of a
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
         harmonics blur them. Costs memory and time with the texels' number; diffuse light only.
+    sampling: which elements of a cubemap's direct light are traced. "every": all. "sparse": about an eighth of them,
+        from which the rest is woven (Huang 2010): up to twice as fast for detailed meshes, slower for simple ones, with
+        an error of about 1 %, which is measured. "automatic": sparse only where that is surely faster and its error no
+        more than compression_error.
     memory_budget: GB of transfer kept in memory while a cubemap is baked; what is more goes to a file; 0 = no limit.
     fit_order_to_light: lower the order to what the scene's present light carries.
     lighting: "environment" (World and Suns), "local" (lamps that move within a light cloud), or both with a comma.
@@ -97,6 +102,7 @@ class BakeSettings:
     subsurface: bool = True
     distant_basis: str = "sh"
     cubemap_size: int = 16
+    sampling: str = "automatic"
     memory_budget: float = 2.0
     fit_order_to_light: bool = False
     lighting: str = "environment"
@@ -222,7 +228,7 @@ def check(settings: BakeSettings) -> BakeSettings:
         raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
                            f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
     for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES), ("lamp_basis", LAMP_BASES),
-                        ("distant_basis", DISTANT_BASES)):
+                        ("distant_basis", DISTANT_BASES), ("sampling", SAMPLINGS)):
         if getattr(settings, name) not in words:
             raise BadArguments(f"setting {name}", f"{getattr(settings, name)!r} is unknown",
                                f"Use one of {' or '.join(words)}")

@@ -88,7 +88,7 @@ def _tasks(receivers: ReceiverSet, r: int, samples: int) -> Iterator[_Task]:
     """Chunks of texels for every block of receivers."""
     count = samples * samples
     directions = np.ascontiguousarray(sample_directions(r, samples).reshape(-1, 3), np.float32)
-    weights = _part_weights(r, samples)
+    weights = part_weights(r, samples)
     at_once = max(1, CHUNK // count)
     for block in blocks(len(receivers), 0, 0):
         normals = receivers.normals[block.receivers]
@@ -103,7 +103,7 @@ def _tasks(receivers: ReceiverSet, r: int, samples: int) -> Iterator[_Task]:
             yield _Task(block, texels, directions[part], weights[part], scale)
 
 
-def _part_weights(r: int, samples: int) -> Single:
+def part_weights(r: int, samples: int) -> Single:
     """Solid angles over pi (6 r r * samples^2,) of the parts of all texels, in the order of `sample_directions`."""
     face = grid_solid_angles(texel_edges(r * samples)).reshape(r, samples, r, samples).transpose(0, 2, 1, 3)
     return np.tile((face / np.pi).ravel(), 6).astype(np.float32)
