@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.relighting.exit_radiance import baked_constants
 from ..prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
-from . import image_textures, programs
+from . import image_textures, programs, texel_programs
 from .image_textures import TexturedVertices, textured_vertices
 from .render_data import (
     DrawItem,
@@ -58,6 +58,7 @@ class ObjectDrawing:
         self._textured: list[_TexturedPart] = []
         self._textures_key: Hashable = None
         self._encoding = make_texture(data.encoding)
+        self._atlas = None if data.atlas is None else make_texture(data.atlas)
         self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
         self._colours: gpu.types.GPUTexture | None = None
         self._plain_batch: gpu.types.GPUBatch | None = None  # for colours, one vertex per point
@@ -143,9 +144,14 @@ class ObjectDrawing:
         """Draw some of the triangles. image: of their albedo, see `image_textures`."""
         depends_on_view = bool(self.data.functions) and self._colours is None
         textured = image is not None
-        program = (programs.view_surface(self.data.functions, textured) if depends_on_view else
-                   programs.surface(textured))
+        functions = self.data.functions if depends_on_view else ()
+        if self._atlas is not None:
+            program = texel_programs.texel_surface(functions, textured)
+        else:
+            program = programs.view_surface(functions, textured) if depends_on_view else programs.surface(textured)
         program.bind()
+        if self._atlas is not None:
+            program.uniform_sampler("atlas_points", self._atlas)
         exit_values = self._exit if self._colours is None else self._colours
         direct = self._direct if self._colours is None else None
         program.uniform_sampler("exit_values", exit_values)
@@ -175,14 +181,18 @@ def _make_vertices(data: RenderData, textured: TexturedVertices | None = None) -
     """The vertices with their albedo or places in textures, and their frames where the view counts. gl_VertexID is the
     point's number where neither is."""
     attributes = {"position": data.positions, "albedo": data.albedo}
-    if data.functions:
+    if data.atlas is not None:
+        attributes["place_in_atlas"] = data.atlas_places
+        if programs.sees_viewer(data.functions):
+            attributes |= {"normal": data.normals, "tangent": data.tangents}
+    elif data.functions:
         numbers = np.stack([data.receivers, data.turns], axis=1).astype(np.float32)  # exact up to 2^24 points
         attributes |= {"normal": data.normals, "tangent": data.tangents, "receiver_and_turn": numbers}
     if textured is not None:
         del attributes["albedo"]
         attributes = {name: np.ascontiguousarray(values[textured.vertices]) for name, values in attributes.items()}
         attributes["place"] = textured.places
-        if not data.functions:
+        if not data.functions and data.atlas is None:
             attributes["receiver"] = textured.vertices.astype(np.float32)[:, None]
     layout = gpu.types.GPUVertFormat()
     for name, values in attributes.items():

@@ -9,6 +9,7 @@ raises on OpenGL.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import gpu
 
@@ -18,6 +19,7 @@ from .compute_program import ComputeProgram, source
 from .render_data import TEXTURE_WIDTH
 
 GROUP_SIZE = 64  # invocations of a work group; divides TEXTURE_WIDTH
+RELEASED_TOO: list[Callable[[], None]] = []  # what frees the programs of modules that build on this one
 
 
 EXIT_RADIANCE = ComputeProgram(
@@ -40,7 +42,7 @@ def surface(textured: bool = False) -> gpu.types.GPUShader:
     info = gpu.types.GPUShaderCreateInfo()
     info.define("TEXTURE_WIDTH", str(TEXTURE_WIDTH))
     info.vertex_in(0, "VEC3", "position")
-    _add_albedo(info, varyings, textured, 1)
+    add_albedo(info, varyings, textured, 1)
     if textured:
         info.vertex_in(2, "FLOAT", "receiver")
     info.vertex_out(varyings)
@@ -68,14 +70,15 @@ def depth_alone() -> gpu.types.GPUShader:
     return gpu.shader.create_from_info(info)
 
 
-def _add_albedo(info: gpu.types.GPUShaderCreateInfo, varyings: gpu.types.GPUStageInterfaceInfo, textured: bool,
-                slot: int) -> None:
-    """Declare where albedo.glsl takes its colour from: the vertices, by an attribute in a slot, or an image."""
+def add_albedo(info: gpu.types.GPUShaderCreateInfo, varyings: gpu.types.GPUStageInterfaceInfo, textured: bool,
+               slot: int, sampler: int = 2) -> None:
+    """Declare where albedo.glsl takes its colour from: the vertices, by an attribute in a slot, or an image, in the
+    place `sampler`."""
     if textured:
         info.define("TEXTURED")
         info.vertex_in(slot, "VEC2", "place")
         varyings.smooth("VEC2", "texture_place")
-        info.sampler(2, "FLOAT_2D", "albedo_image")
+        info.sampler(sampler, "FLOAT_2D", "albedo_image")
         info.push_constant("VEC4", "texture_factor")
     else:
         info.vertex_in(slot, "VEC3", "albedo")
@@ -109,7 +112,7 @@ def view_surface(functions: tuple[int, ...], textured: bool = False) -> gpu.type
     for slot, name in enumerate(("position", "normal", "tangent")):
         info.vertex_in(slot, "VEC3", name)
     info.vertex_in(3, "VEC2", "receiver_and_turn")
-    _add_albedo(info, varyings, textured, 4)
+    add_albedo(info, varyings, textured, 4)
     info.vertex_out(varyings)
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.sampler(0, "FLOAT_2D", "exit_values")
@@ -132,6 +135,8 @@ def view_surface(functions: tuple[int, ...], textured: bool = False) -> gpu.type
 def release() -> None:
     """Free all programs; the next use compiles them again."""
     compute_program.release()
+    for forget in RELEASED_TOO:
+        forget()
     surface.cache_clear()
     depth_alone.cache_clear()
     view_surface.cache_clear()

@@ -26,6 +26,7 @@ from ..prt_addon.relighting.lamp_light import (
     lamp_shape,
     lamps_in,
 )
+from ..prt_addon.relighting.live_scattering import LiveScattering, bounced_light
 from ..prt_addon.relighting.moved_light import lamp_in, points_in
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
@@ -49,6 +50,7 @@ class SceneLamps:
     _clouds: dict[tuple[str, bytes], LampLight | SurfaceLamps] = field(default_factory=dict)
     _lit: dict[tuple[str, bytes], CloudLight] = field(default_factory=dict)
     _direct: dict[tuple[str, bytes], DirectLight] = field(default_factory=dict)
+    _scattering: dict[str, tuple[BakedTransfer, LiveScattering]] = field(default_factory=dict)  # by object
     _keys: dict[int, tuple[LocalBasis, str]] = field(default_factory=dict)  # by the cloud's identity
 
     def forget_geometry(self) -> None:
@@ -124,7 +126,17 @@ class SceneLamps:
         if key not in self._direct:
             self._direct[key] = DirectLight(self._traced(moved), baked)
         samples = [QUICK_SAMPLES if lamp.key in moving else SHADOW_SAMPLES for lamp in lamps]
-        return self._direct[key].of(_as_seen(lamps, moved), samples)
+        found = self._direct[key].of(_as_seen(lamps, moved), samples)
+        if baked.links is None or not lamps:
+            return found
+        return self.scattering(name, baked).added(found, bounced_light(baked, self.cloud_light(baked, moved)))
+
+    def scattering(self, name: str, baked: BakedTransfer) -> LiveScattering:
+        """What takes the lamps' light through an object's translucent bodies; made once."""
+        held = self._scattering.get(name)
+        if held is None or held[0] is not baked:
+            held = self._scattering[name] = baked, LiveScattering(baked)
+        return held[1]
 
     def _cloud_key(self, baked: BakedTransfer) -> str:
         """`cloud_key`, computed once: redraws ask for it."""

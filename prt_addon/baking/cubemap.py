@@ -24,6 +24,7 @@ from ..transport.cubemap_transfer import bounced_columns, cubemap_transfer
 from ..transport.interreflection import Interreflection
 from ..transport.receiver_set import ReceiverSet
 from ..transport.texel_elements import TexelElements
+from ..transport.texel_visibility import TexelVisibility
 from .distant_basis import DistantBasis, array_budget
 from .sampling import SampledDirect, choose, sparse_direct
 from .settings import BakeSettings
@@ -43,15 +44,16 @@ def is_kept(transfer: Single, settings: BakeSettings) -> bool:
 
 def direct_cubemap(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, basis: DistantBasis,
                    settings: BakeSettings, shadow_rays: bool, light: ReferenceLight | None, folder: Path | None,
-                   ) -> Generator[float, None, SampledDirect]:
-    """Yield progress, return direct transfer (r, columns) of every element, or woven from a part of them."""
+                   plain: TexelVisibility | None = None) -> Generator[float, None, SampledDirect]:
+    """Yield progress, return direct transfer (r, columns) of every element, or woven from a part of them. plain:
+    collects what receivers with highlights see, which takes every element."""
     samples = basis.samples(settings.directions)
     elements = TexelElements(tracer, receivers, basis.cubemap, samples)
-    sparsely, left_out = choose(elements, settings, shadow_rays)
+    sparsely, left_out = choose(elements, settings, shadow_rays, plain is not None)
     if sparsely:
         return (yield from sparse_direct(elements, scene, basis, settings, light, folder))
     transfer = yield from cubemap_transfer(tracer, receivers, basis.cubemap, samples, shadow_rays,
-                                           array_budget(settings), folder)
+                                           array_budget(settings), folder, plain)
     return SampledDirect(transfer.T, None, {}, left_out)
 
 

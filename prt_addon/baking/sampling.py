@@ -23,11 +23,12 @@ from ..scene.needs import LeftOut
 from ..scene.object_mesh import bounding_diagonal
 from ..scene.scene_mesh import SceneMesh
 from ..transport.receiver_set import ReceiverSet
-from ..transport.sparse_plan import HARDER_RAYS, SAMPLED, SparsePlan, element_seconds, overhead, plan
+from ..transport.sparse_plan import HARDER_RAYS, SAMPLED, element_seconds, overhead, plan
 from ..transport.sparse_sampling import VERTICES, SparseSettings, SparseTransfer, sparse_transfer
 from ..transport.texel_elements import TexelElements
 from .distant_basis import DistantBasis, array_budget
 from .settings import BakeSettings
+from .sparse_choice import SAVED, SPARSE, sparse_line
 
 Single = NDArray[np.float32]
 
@@ -52,14 +53,14 @@ class SampledDirect:
     facts: dict[str, Any]
     left_out: LeftOut | None = None
 
-    def packed(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        """Arrays and header of a finished stage."""
-        arrays = {"transfer": self.transfer} | ({} if self.dense is None else {"dense": self.dense})
+    def kept(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
+        """Arrays and header of a finished stage, besides the transfer."""
+        arrays = {} if self.dense is None else {"dense": self.dense}
         return arrays, {"facts": self.facts, "left_out": None if self.left_out is None else asdict(self.left_out)}
 
     @staticmethod
     def unpacked(arrays: dict[str, NDArray], header: dict[str, Any]) -> SampledDirect:
-        """What `packed` gave."""
+        """What `kept` gave, with the transfer."""
         left_out = header.get("left_out")
         return SampledDirect(arrays["transfer"], arrays.get("dense"), header.get("facts", {}),
                              LeftOut(**left_out) if left_out else None)
@@ -72,20 +73,20 @@ def sampling_hints(settings: BakeSettings) -> list[str]:
     return []
 
 
-def is_sparse(settings: BakeSettings) -> bool:
+def is_sparse(settings: BakeSettings, highlights: bool = False) -> bool:
     """Whether sparse sampling was asked for, and there is something to sample."""
-    return (settings.sampling == "sparse" and settings.distant_light and settings.distant_basis == "cubemap"
-            and settings.cubemap_size >= SMALLEST)
+    return (settings.sampling == "sparse" and not highlights and settings.cubemap_size >= SMALLEST
+            and settings.distant_light and settings.distant_basis == "cubemap")
 
 
-def forecast_share(settings: BakeSettings) -> float:
+def forecast_share(settings: BakeSettings, highlights: bool) -> float:
     """Of the rays of every element, those that a bake will trace."""
-    return SAMPLED / 0.5 if is_sparse(settings) else 1.0
+    return SAMPLED / 0.5 if is_sparse(settings, highlights) else 1.0
 
 
-def forecast_seconds(settings: BakeSettings, receivers: int, columns: int) -> float:
+def forecast_seconds(settings: BakeSettings, receivers: int, columns: int, highlights: bool) -> float:
     """What sparse sampling takes besides rays."""
-    return overhead(columns) * receivers * columns if is_sparse(settings) else 0.0
+    return overhead(columns) * receivers * columns if is_sparse(settings, highlights) else 0.0
 
 
 def dense_bytes(settings: BakeSettings, receivers: int, columns: int) -> float:
@@ -97,30 +98,27 @@ def dense_bytes(settings: BakeSettings, receivers: int, columns: int) -> float:
     return SparseSettings().dense * held + BLOCK_BYTES * min(receivers, VERTICES) * columns
 
 
-def choose(elements: TexelElements, settings: BakeSettings, shadow_rays: bool) -> tuple[bool, LeftOut | None]:
-    """Whether to sample sparsely, and why not where it isn't that every element was asked for."""
+def choose(elements: TexelElements, settings: BakeSettings, shadow_rays: bool, highlights: bool = False,
+           ) -> tuple[bool, LeftOut | None]:
+    """Whether to sample sparsely, and why not where it isn't that every element was asked for. highlights: what they
+    need of single texels is collected on the way."""
     if settings.sampling == "every":
         return False, None
     if not shadow_rays:
-        return False, LeftOut("sparse sampling", "nothing casts a shadow: every element is known without a ray",
-                              "an error of about 1 %")
-    if elements.r < SMALLEST:
-        return False, LeftOut("sparse sampling", f"a cubemap of {elements.r} texels along an edge is too coarse for it",
-                              "an error of 10 % and more")
+        return False, LeftOut(SPARSE, "nothing casts a shadow: every element is known without a ray", SAVED)
+    if highlights:
+        return False, LeftOut(SPARSE, "highlights need to know what every texel shows", SAVED)
+    coarse = elements.r < SMALLEST
     if settings.sampling == "sparse":
-        return True, None
+        why = f"a cubemap of {elements.r} texels along an edge is too coarse for it"
+        return not coarse, LeftOut(SPARSE, why, SAVED) if coarse else None
     seconds = element_seconds(elements, settings.seed)
     found = plan(len(elements), elements.columns, seconds, harder=HARDER_RAYS)
-    fine = settings.compression_error < TYPICAL_ERROR
-    return found.pays and not fine, None if found.pays and not fine else sparse_line(found, fine)
-
-
-def sparse_line(found: SparsePlan, fine: bool = False) -> LeftOut:
-    """The line of a bake that traces every element. fine: less error is asked for than sparse sampling has."""
-    why = found.why.split(": ", 1)[1]
-    if found.pays and fine:
-        why = f"it would take {why}, but its error, about 1 %, is above compression_error"
-    return LeftOut("sparse sampling", why, "an error of about 1 %")
+    exact_enough = settings.compression_error >= TYPICAL_ERROR and not coarse
+    if found.pays and exact_enough:
+        return True, None
+    return False, sparse_line(found, "it gains too little for its error" if exact_enough else
+                              "its error, about 1 %, is above compression_error")
 
 
 def sparse_direct(elements: TexelElements, scene: SceneMesh, basis: DistantBasis, settings: BakeSettings,
@@ -138,8 +136,8 @@ def sparse_direct(elements: TexelElements, scene: SceneMesh, basis: DistantBasis
 
 
 def sparse_settings(positions: NDArray[np.float64], seed: int) -> SparseSettings:
-    """As published, but for the radius: within it most receivers at positions (r, 3) have NEIGHBOURS dense ones, however
-    dense the mesh is and however far apart its parts are."""
+    """As published, but for the radius: within it most receivers at positions (r, 3) have NEIGHBOURS dense ones,
+    however dense the mesh is and however far apart its parts are."""
     usual = SparseSettings(seed=seed)
     count = min(len(positions), round(NEIGHBOURS / usual.dense))
     some = np.random.default_rng(seed).permutation(len(positions))[:CHECKED]

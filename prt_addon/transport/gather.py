@@ -183,9 +183,12 @@ def face_shares(scene: SceneMesh) -> NDArray[np.float32]:
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
     left = 0.5 * (1.0 + np.sum(scene.normals[scene.triangles] * face[:, None, :], axis=2))
-    faces, weights = adjacent_faces(scene.points, scene.triangles)
+    faces, weights = adjacent_faces(scene.points, scene.triangles, scene.faces)
     mean = np.sum(weights * 0.5 * (1.0 + np.sum(faces * scene.normals[:, None, :], axis=2)), axis=1)
-    return (left / np.maximum(mean, 1e-3)[scene.triangles]).astype(np.float32)
+    shares = (left / np.maximum(mean, 1e-3)[scene.triangles]).astype(np.float32)
+    if scene.faces is not None:  # a texel has one face, whatever triangles join it to others
+        shares[scene.faces.any(axis=1)[scene.triangles]] = 1.0
+    return shares
 
 
 def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDArray[np.float64], group: int,

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ..basis.cubemap import sample_directions, texel_count
 from ..linear_algebra import multiply
 from ..tracing.tracer import Tracer
-from .cubemap_transfer import part_weights
 from .elements import RAYS, Places, Single
 from .receiver_set import ReceiverSet
+from .texel_visibility import part_solid_angles
 
 # Cosines of receivers in all directions in one go: 64 x 6,144 of them are 1.5 MB.
 AT_ONCE = 64
@@ -41,7 +41,8 @@ class TexelElements:
 
     def __post_init__(self) -> None:
         self._directions = np.ascontiguousarray(sample_directions(self.r, self.samples), np.float32)
-        self._weights = part_weights(self.r, self.samples).reshape(self._directions.shape[:2])
+        weights = (part_solid_angles(self.r, self.samples) / np.pi).astype(np.float32)
+        self._weights = weights.reshape(self._directions.shape[:2])
 
     @property
     def columns(self) -> int:

@@ -12,8 +12,9 @@ import pytest
 from prt_addon.baking.distant_basis import DistantBasis
 from prt_addon.baking.plan import make_plan
 from prt_addon.baking.recipe import bake, exhaust
-from prt_addon.baking.sampling import can_start_dense, choose, encode_from_dense, sparse_line
+from prt_addon.baking.sampling import can_start_dense, choose, encode_from_dense
 from prt_addon.baking.settings import BakeSettings, make_settings
+from prt_addon.baking.sparse_choice import SPARSE
 from prt_addon.compression.settings import EncoderSettings
 from prt_addon.errors import BadArguments
 from prt_addon.lighting.reference_light import ReferenceLight
@@ -24,11 +25,10 @@ from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.tracing.tracer import Tracer
 from prt_addon.transport.cubemap_transfer import cubemap_transfer
 from prt_addon.transport.receiver_set import ReceiverSet
-from prt_addon.transport.sparse_plan import plan
 from prt_addon.transport.texel_elements import TexelElements
 from tests.core.shapes import drain, join, make, plane, sphere
 
-SPARSE = BakeSettings(distant_basis="cubemap", cubemap_size=8, directions=1024, gather_directions=64, vectors=12,
+WOVEN = BakeSettings(distant_basis="cubemap", cubemap_size=8, directions=1024, gather_directions=64, vectors=12,
                       clusters=24, encoder="iterative", spacing=0.0, compression_error=1e-3, error_receivers=0,
                       sampling="sparse", threads=1)
 
@@ -53,7 +53,7 @@ def difference(one, other, edge=8):
 
 @pytest.fixture(scope="module")
 def pair():
-    return tuple(exhaust(bake(still_life(), replace(SPARSE, sampling=way), light=sunny()))
+    return tuple(exhaust(bake(still_life(), replace(WOVEN, sampling=way), light=sunny()))
                  for way in ("sparse", "every"))
 
 
@@ -98,7 +98,7 @@ def test_clustered_pca_starts_from_dense_points(pair):
 
 
 def test_the_same_on_any_threads_and_from_a_file(pair, tmp_path):
-    settings = replace(SPARSE, bounces=2)
+    settings = replace(WOVEN, bounces=2)
     first = exhaust(bake(still_life(), settings, light=sunny()))
     for other in (replace(settings, threads=3), replace(settings, memory_budget=1e-6)):
         again = exhaust(bake(still_life(), other, tmp_path, light=sunny()))
@@ -112,20 +112,20 @@ def test_the_same_on_any_threads_and_from_a_file(pair, tmp_path):
 
 def test_a_stopped_bake_goes_on_and_tells_the_same(pair, tmp_path):
     for until in ("direct", "encode"):
-        steps = bake(still_life(), SPARSE, tmp_path, light=sunny())
+        steps = bake(still_life(), WOVEN, tmp_path, light=sunny())
         for number, progress in enumerate(steps):
             if progress.stage == until and (until == "encode" or number > 8):
                 break
         steps.close()
     assert (tmp_path / "direct.npz").exists()
-    again = exhaust(bake(still_life(), SPARSE, tmp_path, light=sunny()))
+    again = exhaust(bake(still_life(), WOVEN, tmp_path, light=sunny()))
     assert "direct" in again.report["resumed"] and again.report["sampling"] == pair[0].report["sampling"]
     for name, container in again.objects.items():
         assert np.array_equal(container.weights, pair[0].objects[name].weights)
 
 
 def test_progress_grows_to_the_end():
-    fractions = [step.fraction for step in bake(still_life(), replace(SPARSE, bounces=0, encoder="static"))]
+    fractions = [step.fraction for step in bake(still_life(), replace(WOVEN, bounces=0, encoder="static"))]
     assert len(fractions) > 8 and fractions == sorted(fractions)
 
 
@@ -136,7 +136,7 @@ def test_extreme_scenes():
     lone = make("lone", [(0, 0, 9), (0.01, 0, 9), (0, 0.01, 9)], [(0, 1, 2)])
     scene = SceneMesh.assemble([plane(size=4.0, cells=12), sphere(centre=(0, 0, 0.9), radius=0.8), far, twice, lone])
     for edge in (8, 2):
-        settings = replace(SPARSE, cubemap_size=edge, directions=64, bounces=1)
+        settings = replace(WOVEN, cubemap_size=edge, directions=64, bounces=1)
         sparse, every = (exhaust(bake(scene, replace(settings, sampling=way), light=sunny()))
                          for way in ("sparse", "every"))
         assert all(np.isfinite(found.bases).all() for found in sparse.objects.values())
@@ -150,40 +150,40 @@ def test_extreme_scenes():
             assert difference(sparse, every, edge) == 0.0
     assert any("too coarse" in line["why"] for line in sparse.report["left_out"])
     one = SceneMesh.assemble([lone, replace(plane(size=0.1, height=9.5, up=False), is_target=False)])
-    assert len(exhaust(bake(one, SPARSE)).objects["lone"].weights) == 3
+    assert len(exhaust(bake(one, WOVEN)).objects["lone"].weights) == 3
 
 
 def test_other_encoders_and_lamps_take_sparse_columns():
     for change in ({"encoder": "eigentransport"}, {"encoder": "adaptive", "vectors": 3},
                    {"lighting": "environment,local", "surface_columns": 8, "surface_patches": 32, "cloud_lights": 4}):
         scene = SceneMesh.assemble([plane(size=4.0, cells=12), sphere(centre=(0, 0, 0.9), radius=0.8)])
-        settings = replace(SPARSE, bounces=1, clusters=6, vectors=4)
+        settings = replace(WOVEN, bounces=1, clusters=6, vectors=4)
         found = exhaust(bake(scene, replace(settings, **change), light=sunny()))
         assert found.report["sampling"]["chosen"] == "sparse"
 
 
 def test_automatic_takes_every_element_and_says_why():
-    settings = replace(SPARSE, sampling="automatic", bounces=0, clusters=4, vectors=2)
+    settings = replace(WOVEN, sampling="automatic", bounces=0, clusters=4, vectors=2)
     scene = SceneMesh.assemble([plane(size=4.0, cells=12), sphere(centre=(0, 0, 0.9), radius=0.8)])
     found = exhaust(bake(scene, settings, light=sunny()))
-    lines = [line for line in found.report["left_out"] if line["what"] == "sparse sampling"]
-    assert len(lines) == 1 and " s, sparse sampling " in lines[0]["why"] and found.report["sampling"] == {}
+    lines = [line for line in found.report["left_out"] if line["what"] == SPARSE]
+    assert len(lines) == 1 and "tracing all of them takes about" in lines[0]["why"] and found.report["sampling"] == {}
 
 
 def test_automatic_by_the_cost_of_an_element_and_the_error_asked_for(monkeypatch):
     scene = SceneMesh.assemble([sphere(radius=0.5, centre=(0, 0, 0.6)), plane(size=4.0, cells=15)])
     tracer = Tracer(scene.points, scene.triangles, 1)
     elements = TexelElements(tracer, ReceiverSet.of_keys(scene, tracer, np.flatnonzero(~scene.loose)), 8, 2)
-    automatic = replace(SPARSE, sampling="automatic")
+    automatic = replace(WOVEN, sampling="automatic")
     for cost, error, expected in ((1e-7, 0.02, False), (1e-3, 0.02, True), (1e-3, 0.002, False)):
         monkeypatch.setattr("prt_addon.baking.sampling.element_seconds", lambda *_, cost=cost: cost)
         sparsely, line = choose(elements, replace(automatic, compression_error=error), True)
         assert sparsely == expected and (line is None) == expected
-        assert expected or "s" in line.why
+        assert expected or ("compression_error" in line.why) == (cost == 1e-3)
     assert choose(elements, replace(automatic, sampling="every"), True) == (False, None)
     assert choose(elements, replace(automatic, sampling="sparse"), True) == (True, None)
     assert not choose(elements, replace(automatic, sampling="sparse"), False)[0]
-    assert "compression_error" in sparse_line(plan(50_000, 6144, 1e-3), fine=True).why
+    assert "highlights" in choose(elements, replace(automatic, sampling="sparse"), True, True)[1].why
 
 
 def test_points_in_one_place_join_themselves():
@@ -200,8 +200,8 @@ def test_settings_and_forecast():
     with pytest.raises(BadArguments, match="sampling"):
         make_settings("draft", {"sampling": "some"})
     scene = still_life()
-    sparse, every = (make_plan(scene, replace(SPARSE, sampling=way), None) for way in ("sparse", "every"))
+    sparse, every = (make_plan(scene, replace(WOVEN, sampling=way), None) for way in ("sparse", "every"))
     assert sparse.rays["direct"] < 0.3 * every.rays["direct"]
     assert sparse.peak_bytes >= every.peak_bytes
-    harmonics = make_plan(scene, replace(SPARSE, distant_basis="sh"), None)
+    harmonics = make_plan(scene, replace(WOVEN, distant_basis="sh"), None)
     assert any("distant_basis=cubemap" in hint for hint in harmonics.needs.hints)
