@@ -6,12 +6,14 @@ Reading order is data order:
     render_data.py   pure numpy: a BakedTransfer as the arrays that go to the GPU, and the signatures that say when
                      they changed. Never imports gpu or bpy.
     hemisphere_glsl.py   pure text: the functions of the view as GLSL.
+    compute_program.py  a compute program described once, for Blender and as plain GLSL
     programs.py      GLSL files -> the programs (cached; released by `programs.release`).
     image_textures.py   vertices that carry places in image textures, and the images as Blender holds them
     draw.py          GPU objects of one baked object (`ObjectDrawing`) and of a list of them (`DrawingCache`): built
                      when the data's signature changes, relit when the light's changes, else only drawn.
     overlay.py       marks over the picture: points, lines, triangles, and the legend of false colours
     occluders.py     depth of surfaces that are not ours, where Blender leaves none.
+    ray_programs.py, ray_device.py, tracing_worker.py   rays on the GPU, in a child process (docs/ray_engine.md)
     viewport.py      the draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
     offscreen.py     `draw_camera` for background mode and the bpy wheel, `write_png`.
 

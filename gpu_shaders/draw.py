@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.relighting.exit_radiance import baked_constants
 from ..prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
-from . import image_textures, programs
+from . import image_textures, programs, texel_programs
 from .image_textures import TexturedVertices, textured_vertices
 from .render_data import (
     DrawItem,
+    LampScattering,
     RenderData,
     clip_transform,
     constant_texels,
@@ -32,20 +33,10 @@ from .render_data import (
     texture_values,
     viewer_of,
 )
+from .scattering import ScatteringPasses, bounced_texture
+from .textures import make_texture, read_texture
 
 STALE_DIMMING = 0.3  # factor on a stale object's radiance
-
-
-def make_texture(texels: NDArray[np.float32]) -> gpu.types.GPUTexture:
-    """An RGBA32F texture of (height, width, 4) values."""
-    height, width, _ = texels.shape
-    buffer = gpu.types.Buffer("FLOAT", texels.size, np.ascontiguousarray(texels, np.float32).reshape(-1))
-    return gpu.types.GPUTexture((width, height), format="RGBA32F", data=buffer)
-
-
-def read_texture(texture: gpu.types.GPUTexture) -> NDArray[np.float32]:
-    """The values of an RGBA32F texture, (height, width, 4); row 0 is the texture's first, the lowest of a picture."""
-    return np.array(texture.read(), np.float32).reshape(texture.height, texture.width, 4)
 
 
 class ObjectDrawing:
@@ -58,11 +49,14 @@ class ObjectDrawing:
         self._textured: list[_TexturedPart] = []
         self._textures_key: Hashable = None
         self._encoding = make_texture(data.encoding)
+        self._atlas = None if data.atlas is None else make_texture(data.atlas)
         self._exit = gpu.types.GPUTexture(data.exit_size, format="RGBA32F")
         self._colours: gpu.types.GPUTexture | None = None
         self._plain_batch: gpu.types.GPUBatch | None = None  # for colours, one vertex per point
         self._direct: gpu.types.GPUTexture | None = None
         self._direct_values: NDArray[np.float32] | None = None
+        self._scattering: LampScattering | None = None
+        self._passes: ScatteringPasses | None = None
 
     def relight(self, constants: NDArray[np.float32]) -> None:
         """Compute every point's exit radiance from per-cluster constants (clusters, vectors + 1, rows, 3)."""
@@ -90,15 +84,32 @@ class ObjectDrawing:
             plain = plain_surface(self.data)
             self._plain_batch = _make_batch(_make_vertices(plain), plain.triangles)
 
-    def add_direct(self, values: NDArray[np.float32] | None) -> None:
+    def add_direct(self, values: NDArray[np.float32] | None, scattering: LampScattering | None = None) -> None:
         """Direct light (points, rows, 3), for unit albedo in row 0, to add from now on; None for none."""
-        if values is self._direct_values:
+        if values is self._direct_values and scattering is self._scattering:
             return
         expected = (self.data.points, self.data.rows, 3)
         if values is not None and values.shape != expected:
             raise ValueError(f"direct light has shape {values.shape}, the drawn data needs {expected}")
-        self._direct_values = values
+        self._direct_values, self._scattering = values, scattering
         self._direct = None if values is None else make_texture(texture_values(values.reshape(-1, 3)))
+        if self._direct is not None and scattering is not None:
+            self._scatter(scattering)
+
+    def _scatter(self, scattering: LampScattering) -> None:
+        """Take the direct light through the body here, or find out once how long that would take."""
+        live, data = scattering.live, self.data
+        if not scattering.on_card and live.card_seconds is not None:
+            return
+        if self._passes is None or self._passes.live is not live:
+            self._passes = ScatteringPasses(live)
+        if scattering.on_card:
+            bounced = None if scattering.bounced is None else bounced_texture(scattering.bounced)
+            self._direct = self._passes.run(self._direct, bounced, data.points, data.rows)
+        else:
+            live.card_seconds = self._passes.seconds(data.points, data.rows)
+            if live.card_seconds >= live.seconds:
+                self._passes = None  # the processor will go on
 
     def show_textures(self, textures: SurfaceTextures | None) -> None:
         """Take the albedo from images from now on; None for that of the points."""
@@ -143,9 +154,14 @@ class ObjectDrawing:
         """Draw some of the triangles. image: of their albedo, see `image_textures`."""
         depends_on_view = bool(self.data.functions) and self._colours is None
         textured = image is not None
-        program = (programs.view_surface(self.data.functions, textured) if depends_on_view else
-                   programs.surface(textured))
+        functions = self.data.functions if depends_on_view else ()
+        if self._atlas is not None:
+            program = texel_programs.texel_surface(functions, textured)
+        else:
+            program = programs.view_surface(functions, textured) if depends_on_view else programs.surface(textured)
         program.bind()
+        if self._atlas is not None:
+            program.uniform_sampler("atlas_points", self._atlas)
         exit_values = self._exit if self._colours is None else self._colours
         direct = self._direct if self._colours is None else None
         program.uniform_sampler("exit_values", exit_values)
@@ -175,14 +191,18 @@ def _make_vertices(data: RenderData, textured: TexturedVertices | None = None) -
     """The vertices with their albedo or places in textures, and their frames where the view counts. gl_VertexID is the
     point's number where neither is."""
     attributes = {"position": data.positions, "albedo": data.albedo}
-    if data.functions:
+    if data.atlas is not None:
+        attributes["place_in_atlas"] = data.atlas_places
+        if programs.sees_viewer(data.functions):
+            attributes |= {"normal": data.normals, "tangent": data.tangents}
+    elif data.functions:
         numbers = np.stack([data.receivers, data.turns], axis=1).astype(np.float32)  # exact up to 2^24 points
         attributes |= {"normal": data.normals, "tangent": data.tangents, "receiver_and_turn": numbers}
     if textured is not None:
         del attributes["albedo"]
         attributes = {name: np.ascontiguousarray(values[textured.vertices]) for name, values in attributes.items()}
         attributes["place"] = textured.places
-        if not data.functions:
+        if not data.functions and data.atlas is None:
             attributes["receiver"] = textured.vertices.astype(np.float32)[:, None]
     layout = gpu.types.GPUVertFormat()
     for name, values in attributes.items():
@@ -244,7 +264,7 @@ class DrawingCache:
             else:
                 drawing.show_colours(heat_colours(item.heat) if item.colours is None else item.colours.values)
             self._lights[item.key] = light
-        drawing.add_direct(item.direct)
+        drawing.add_direct(item.direct, item.scattering)
         drawing.show_textures(item.textures)
         return drawing
 

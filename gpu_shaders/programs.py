@@ -9,35 +9,28 @@ raises on OpenGL.
 from __future__ import annotations
 
 import functools
-from pathlib import Path
+from collections.abc import Callable
 
 import gpu
 
 from ..prt_addon.errors import PRTError
-from . import hemisphere_glsl
+from . import compute_program, hemisphere_glsl
+from .compute_program import ComputeProgram, source
 from .render_data import TEXTURE_WIDTH
 
 GROUP_SIZE = 64  # invocations of a work group; divides TEXTURE_WIDTH
+RELEASED_TOO: list[Callable[[], None]] = []  # what frees the programs of modules that build on this one
 
 
-def _source(*names: str) -> str:
-    """The GLSL files joined in order."""
-    return "\n".join((Path(__file__).parent / name).read_text(encoding="utf-8") for name in names)
+EXIT_RADIANCE = ComputeProgram(
+    ("texel_layout.glsl", "exit_radiance.comp.glsl"), ("encoding_values", "constant_values"),
+    (("exit_values", "WRITE"),), (("INT", "points"), ("INT", "rows"), ("INT", "vectors")),
+    (("TEXTURE_WIDTH", str(TEXTURE_WIDTH)),), (GROUP_SIZE, 1, 1))
 
 
-@functools.cache
 def exit_radiance() -> gpu.types.GPUShader:
     """The compute program that lights the points: see exit_radiance.comp.glsl."""
-    info = gpu.types.GPUShaderCreateInfo()
-    info.define("TEXTURE_WIDTH", str(TEXTURE_WIDTH))
-    info.local_group_size(GROUP_SIZE, 1, 1)
-    info.sampler(0, "FLOAT_2D", "encoding_values")
-    info.sampler(1, "FLOAT_2D", "constant_values")
-    info.image(0, "RGBA32F", "FLOAT_2D", "exit_values", qualifiers={"WRITE"})
-    for name in ("points", "rows", "vectors"):
-        info.push_constant("INT", name)
-    info.compute_source(_source("texel_layout.glsl", "exit_radiance.comp.glsl"))
-    return gpu.shader.create_from_info(info)
+    return EXIT_RADIANCE.shader()
 
 
 @functools.cache
@@ -49,7 +42,7 @@ def surface(textured: bool = False) -> gpu.types.GPUShader:
     info = gpu.types.GPUShaderCreateInfo()
     info.define("TEXTURE_WIDTH", str(TEXTURE_WIDTH))
     info.vertex_in(0, "VEC3", "position")
-    _add_albedo(info, varyings, textured, 1)
+    add_albedo(info, varyings, textured, 1)
     if textured:
         info.vertex_in(2, "FLOAT", "receiver")
     info.vertex_out(varyings)
@@ -60,8 +53,8 @@ def surface(textured: bool = False) -> gpu.types.GPUShader:
     info.push_constant("FLOAT", "direct_share")
     info.push_constant("FLOAT", "exposure")
     info.push_constant("FLOAT", "albedo_share")
-    info.vertex_source(_source("texel_layout.glsl", "surface.vert.glsl"))
-    info.fragment_source(_source("albedo.glsl", "surface.frag.glsl"))
+    info.vertex_source(source("texel_layout.glsl", "surface.vert.glsl"))
+    info.fragment_source(source("albedo.glsl", "surface.frag.glsl"))
     return gpu.shader.create_from_info(info)
 
 
@@ -72,19 +65,20 @@ def depth_alone() -> gpu.types.GPUShader:
     info.vertex_in(0, "VEC3", "position")
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.push_constant("MAT4", "transform")
-    info.vertex_source(_source("depth.vert.glsl"))
-    info.fragment_source(_source("depth.frag.glsl"))
+    info.vertex_source(source("depth.vert.glsl"))
+    info.fragment_source(source("depth.frag.glsl"))
     return gpu.shader.create_from_info(info)
 
 
-def _add_albedo(info: gpu.types.GPUShaderCreateInfo, varyings: gpu.types.GPUStageInterfaceInfo, textured: bool,
-                slot: int) -> None:
-    """Declare where albedo.glsl takes its colour from: the vertices, by an attribute in a slot, or an image."""
+def add_albedo(info: gpu.types.GPUShaderCreateInfo, varyings: gpu.types.GPUStageInterfaceInfo, textured: bool,
+               slot: int, sampler: int = 2) -> None:
+    """Declare where albedo.glsl takes its colour from: the vertices, by an attribute in a slot, or an image, in the
+    place `sampler`."""
     if textured:
         info.define("TEXTURED")
         info.vertex_in(slot, "VEC2", "place")
         varyings.smooth("VEC2", "texture_place")
-        info.sampler(2, "FLOAT_2D", "albedo_image")
+        info.sampler(sampler, "FLOAT_2D", "albedo_image")
         info.push_constant("VEC4", "texture_factor")
     else:
         info.vertex_in(slot, "VEC3", "albedo")
@@ -118,7 +112,7 @@ def view_surface(functions: tuple[int, ...], textured: bool = False) -> gpu.type
     for slot, name in enumerate(("position", "normal", "tangent")):
         info.vertex_in(slot, "VEC3", name)
     info.vertex_in(3, "VEC2", "receiver_and_turn")
-    _add_albedo(info, varyings, textured, 4)
+    add_albedo(info, varyings, textured, 4)
     info.vertex_out(varyings)
     info.fragment_out(0, "VEC4", "fragment_colour")
     info.sampler(0, "FLOAT_2D", "exit_values")
@@ -133,14 +127,16 @@ def view_surface(functions: tuple[int, ...], textured: bool = False) -> gpu.type
     fetch, total = hemisphere_glsl.fetch_rows(functions), hemisphere_glsl.sum_rows(functions)
     fetch += hemisphere_glsl.add_direct_rows(functions)
     turn = hemisphere_glsl.turn_rows(functions)
-    info.vertex_source("\n".join([_source("texel_layout.glsl"), fetch, turn, _source("view_surface.vert.glsl")]))
-    info.fragment_source("\n".join([total, _source("albedo.glsl", "view_surface.frag.glsl")]))
+    info.vertex_source("\n".join([source("texel_layout.glsl"), fetch, turn, source("view_surface.vert.glsl")]))
+    info.fragment_source("\n".join([total, source("albedo.glsl", "view_surface.frag.glsl")]))
     return gpu.shader.create_from_info(info)
 
 
 def release() -> None:
     """Free all programs; the next use compiles them again."""
-    exit_radiance.cache_clear()
+    compute_program.release()
+    for forget in RELEASED_TOO:
+        forget()
     surface.cache_clear()
     depth_alone.cache_clear()
     view_surface.cache_clear()

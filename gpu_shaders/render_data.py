@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..prt_addon.errors import BadScene
+from ..prt_addon.relighting.texel_light import corner_albedo
 from . import hemisphere_glsl
 
 if TYPE_CHECKING:
+    from ..prt_addon.relighting.live_scattering import LiveScattering
     from ..prt_addon.scene.surface_textures import SurfaceTextures
+    from ..prt_addon.scene.texel_surface import TexelSurface
     from ..prt_addon.storage.container import BakedTransfer
 
 # Turn of frames within a triangle, in radians, up to which blending across it shows nothing (functions turn by up to
@@ -42,6 +45,7 @@ class DrawItem:
     direct: (points, rows, 3) float32, what lamps add to the exit radiance: their direct light, which no bake holds.
         Never changed in place: another array means other light.
     exposure: factor on the radiance. stale: drawn dimmed, because the object was edited after its bake.
+    scattering: what takes the lamps' light through the body, where the bake has links for it. Never changed in place.
     heat: (points,) in 0..1 shown as false colours in place of the radiance, or None.
     colours: false colours that are no heat, or None. textures: images that replace the albedo of points, or None.
     """
@@ -56,11 +60,22 @@ class DrawItem:
     direct: NDArray[np.float32] | None = None
     colours: FalseColours | None = None
     textures: SurfaceTextures | None = None
+    scattering: LampScattering | None = None
 
     @property
     def is_lit(self) -> bool:
         """Whether light is shown, not false colours."""
         return self.heat is None and self.colours is None
+
+
+@dataclass(frozen=True, eq=False)
+class LampScattering:
+    """live: of the bake; bounced: (points, 3) E / pi of lamps by way of the scene, or None; on_card: whether `direct`
+    is still to be taken through the body, by the graphics card; else that was done, and the card is only timed."""
+
+    live: LiveScattering
+    bounced: NDArray[np.float32] | None = None
+    on_card: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +94,8 @@ class RenderData:
     encoding: (height, TEXTURE_WIDTH, 4) float32, see `encode`; cluster_vectors: (clusters,) int32, how many of the
     `vectors` each cluster really has (the rest are zero). functions: of the view, one for each row but the first;
     normals, tangents: (vertices, 3) float32, receivers, turns: (vertices,), see `Corners`; None without functions.
+    atlas_places: (vertices, 2) float32 in an atlas and atlas: (height, width, 4) float32 numbers of the points around
+    each square between texels, -1 for none, where points are texels: vertices are then the surface's own; None else.
     """
 
     points: int
@@ -96,6 +113,8 @@ class RenderData:
     tangents: NDArray[np.float32] | None = None
     receivers: NDArray[np.int64] | None = None
     turns: NDArray[np.float32] | None = None
+    atlas_places: NDArray[np.float32] | None = None
+    atlas: NDArray[np.float32] | None = None
 
     @property
     def exit_size(self) -> tuple[int, int]:
@@ -138,6 +157,8 @@ def encode(cluster: NDArray[np.integer], weights: NDArray[np.floating]) -> NDArr
 def make_render_data(baked: BakedTransfer) -> RenderData:
     """The arrays that the GPU needs of a baked object. Raises BadScene when they do not fit textures."""
     clusters, vectors_and_mean, rows, columns, _ = baked.bases.shape
+    if baked.texels is not None:
+        return texel_data(baked, encode(baked.cluster, baked.weights), used_vectors(baked.bases))
     corners = shared_frames(baked) if baked.functions else None
     place = slice(None) if corners is None else corners.receivers
     return RenderData(
@@ -161,9 +182,46 @@ def make_render_data(baked: BakedTransfer) -> RenderData:
 
 def plain_surface(data: RenderData) -> RenderData:
     """The same surface with one vertex per point and no frames, as colours that don't depend on the view need it."""
+    if data.atlas is not None:
+        return replace(data, functions=())
     first = slice(0, data.points)
     triangles = data.receivers[data.triangles].astype(np.int32)
     return replace(data, positions=data.positions[first], albedo=data.albedo[first], triangles=triangles, functions=())
+
+
+def texel_data(baked: BakedTransfer, encoding: NDArray[np.float32], cluster_vectors: NDArray[np.int32]) -> RenderData:
+    """The arrays of a bake at texels: each triangle of the surface has three vertices of its own."""
+    surface = baked.texels
+    clusters, vectors_and_mean, rows, columns, _ = baked.bases.shape
+    corner = surface.triangles.ravel()
+    albedo = corner_albedo(baked).reshape(-1, 3)
+    points, normals, tangents = (np.ascontiguousarray(values[corner], np.float32)
+                                 for values in (surface.points, surface.normals, surface.tangents))
+    return RenderData(
+        points=len(baked.positions),
+        positions=points,
+        albedo=albedo.astype(np.float32),
+        triangles=np.arange(len(corner), dtype=np.int32).reshape(-1, 3),
+        encoding=encoding,
+        clusters=clusters,
+        vectors=vectors_and_mean - 1,
+        rows=rows,
+        columns=columns,
+        cluster_vectors=cluster_vectors,
+        functions=baked.functions,
+        normals=normals,
+        tangents=tangents,
+        atlas_places=np.ascontiguousarray(surface.places.reshape(-1, 2), np.float32),
+        atlas=points_around(surface),
+    )
+
+
+def points_around(surface: TexelSurface) -> NDArray[np.float32]:
+    """(height, width, 4) numbers of the points at lower left, lower right, upper left and upper right of the square
+    whose lower left texel each is; -1 where there is none. Exact in single precision up to 2^24 points."""
+    number = np.full((surface.height + 1, surface.width + 1), -1.0, np.float32)
+    number[surface.row, surface.column] = np.arange(len(surface.row))
+    return np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]], axis=2)
 
 
 @dataclass(frozen=True)
@@ -243,6 +301,8 @@ def transfer_signature(baked: BakedTransfer) -> str:
     """
     digest = hashlib.blake2b(repr(baked.functions).encode(), digest_size=16)
     drawn = [baked.cluster, baked.weights, baked.bases, baked.albedo, baked.positions, baked.triangles]
+    if baked.texels is not None:
+        drawn += [baked.texels.points, baked.texels.places, baked.texels.column, baked.texels.row]
     for values in drawn + ([baked.normals, baked.tangents] if baked.functions else []):
         digest.update(repr((values.shape, values.dtype.str)).encode())
         digest.update(np.ascontiguousarray(values))

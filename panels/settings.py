@@ -39,12 +39,14 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
-        if settings.distant_basis == "cubemap":
+        if settings.distant_basis != "sh":
+            distant.prop(settings, "sampling")
             distant.prop(settings, "memory_budget")
-        else:
+        if settings.distant_basis == "sh":
             distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")
+        self.layout.operator("prt.measure_tracing", icon="SORTTIME")
 
 
 class PRT_PT_highlights(_Expert, bpy.types.Panel):
@@ -61,6 +63,9 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
         shiny.prop(settings, "glossy_albedo")
         shiny.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
+        lamps = column.column()
+        lamps.active = settings.lighting != "environment"
+        lamps.prop(settings, "subsurface_links")
 
 
 class PRT_PT_local_lights(_Expert, bpy.types.Panel):

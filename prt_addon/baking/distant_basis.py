@@ -18,6 +18,7 @@ from ..lighting.cubemap_light import environment_texels, sun_texels
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import for_highlights
 from ..linear_algebra import multiply
+from ..reporting.wording import count, plural
 from ..storage.columns import Columns
 from .settings import BakeSettings
 
@@ -40,6 +41,19 @@ class DistantBasis:
     def columns(self) -> int:
         """How many there are."""
         return self.entry().distant
+
+    @property
+    def facts(self) -> dict[str, int]:
+        """For JSON: the order, or the texels along an edge of the cubemap; and the columns."""
+        size = {"cubemap_size": self.cubemap} if self.cubemap else {"order": self.order}
+        return {**size, "columns": self.columns}
+
+    @property
+    def words(self) -> str:
+        """The same in a line for a person."""
+        if self.cubemap:
+            return f"Sky by a cubemap of 6 x {self.cubemap} x {self.cubemap} texels: {count(self.columns)} columns"
+        return f"Sky by spherical harmonics of order {self.order}: {plural(self.columns, 'column', 'columns')}"
 
     def entry(self, local: int = 0) -> Columns:
         """For the header, with so many columns of local light behind."""

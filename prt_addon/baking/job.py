@@ -7,7 +7,7 @@ afresh. Where another living process bakes the same job, the folder has a number
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
@@ -18,23 +18,29 @@ from numpy.typing import NDArray
 
 from ..errors import StorageError
 from ..lighting.reference_light import ReferenceLight
-from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..scene.scene_mesh import SceneMesh, SceneObject, with_surfaces
 from ..scene.surface_material import SurfaceMaterial
+from ..scene.texel_surface import NUMBERS, TexelSurface
 from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_cloud, read_cloud
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from ..storage.subsurface_links import flatten_links, read_links
+from ..storage.texels import ENTRY as ATLAS_ENTRY
+from ..tracing.tracer import Tracer
+from ..transport.live_operator import LiveOperator
 from .claims import Claim
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
 
 # Raised whenever the same input would give other numbers, so that old stages are not mixed with new code.
-JOB_SCHEMA = 4
+JOB_SCHEMA = 5
 SCENE_FILE, RESULT_FILE = "scene.npz", "result.npz"
 _SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material", "tangents", "source")
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
 _CONTAINER_EXTRA = ("tangents", "source", "error")  # None where there are none
 _LAMP_ARRAYS = ("material", "kernels")  # of lamp_surfaces
+_LIVE_ARRAYS = ("counts", "indices", "values", "surfaces")  # of live
 
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
@@ -54,11 +60,14 @@ def claim_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: Refer
     """
     arrays = {name: getattr(scene, name) for name in _SCENE_ARRAYS}
     arrays["regions"] = np.empty((0, 4, 4)) if regions is None else regions
+    for index, surface in enumerate(scene.surfaces):
+        arrays |= {} if surface is None else _surface_arrays(f"surface_{index}_", surface)
     header = {
         "schema": JOB_SCHEMA,
         "objects": [_object_header(o) for o in scene.objects],
         "materials": [asdict(material) for material in scene.materials],
         "warnings": list(scene.warnings),
+        "surfaces": [None if surface is None else surface.numbers() for surface in scene.surfaces],
         "settings": settings.as_dict(),
         "geometry_digests": digests or {},
         "light": None,
@@ -106,14 +115,25 @@ def read_job(folder: Path) -> tuple[SceneMesh, BakeSettings, ReferenceLight | No
         SceneObject(**{**entry, "points": slice(*entry["points"]), "triangles": slice(*entry["triangles"]),
                        "matrix": np.reshape(entry["matrix"], (4, 4))})
         for entry in header["objects"])
-    scene = SceneMesh(**{name: arrays[name] for name in _SCENE_ARRAYS}, objects=objects,
-                      materials=tuple(_material(entry) for entry in header["materials"]),
-                      warnings=tuple(header["warnings"]))
+    surfaces = tuple(None if numbers is None else _surface(f"surface_{index}_", arrays, numbers)
+                     for index, numbers in enumerate(header["surfaces"]))
+    scene = with_surfaces(SceneMesh(**{name: arrays[name] for name in _SCENE_ARRAYS}, objects=objects,
+                                    materials=tuple(_material(entry) for entry in header["materials"]),
+                                    warnings=tuple(header["warnings"])), surfaces)
     light = None
     if header["light"] is not None:
         stored = {name[len("light_"):]: value for name, value in arrays.items() if name.startswith("light_")}
         light = ReferenceLight.from_arrays(stored, header["light"])
     return scene, BakeSettings(**header["settings"]), light, header["geometry_digests"], arrays["regions"]
+
+
+def _surface_arrays(prefix: str, surface: TexelSurface) -> dict[str, NDArray]:
+    return {prefix + name: values for name, values in surface.arrays().items()}
+
+
+def _surface(prefix: str, arrays: dict[str, NDArray], numbers: dict[str, Any]) -> TexelSurface:
+    return TexelSurface(**{name[len(prefix):]: values for name, values in arrays.items() if name.startswith(prefix)},
+                        **numbers)
 
 
 def _material(entry: dict[str, Any]) -> SurfaceMaterial:
@@ -122,18 +142,24 @@ def _material(entry: dict[str, Any]) -> SurfaceMaterial:
                               for name, value in entry.items()})
 
 
-def run_job(folder: Path) -> Generator[Progress]:
-    """Bake a job, resuming after its finished stages, and leave the result in its folder."""
+def run_job(folder: Path, make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress]:
+    """Bake a job, resuming after its finished stages, and leave the result in its folder. make_tracer: see `bake`."""
     if intact(folder / RESULT_FILE) is not None:
         return
     scene, settings, light, digests, regions = read_job(folder)
-    result = yield from bake(scene, settings, folder, light, digests, regions)
+    result = yield from bake(scene, settings, folder, light, digests, regions, make_tracer)
     arrays = {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
               for name in _CONTAINER_ARRAYS + _CONTAINER_EXTRA if getattr(container, name) is not None}
     arrays |= {f"{index}_cloud": flatten_cloud(container.cloud) for index, container in enumerate(
         result.objects.values()) if container.cloud is not None}
     arrays |= {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
                for name in _LAMP_ARRAYS if container.lamp_surfaces is not None}
+    arrays |= {f"{index}_live_{name}": value for index, container in enumerate(result.objects.values())
+               if container.live is not None for name, value in container.live.arrays().items()}
+    for index, container in enumerate(result.objects.values()):
+        arrays |= {} if container.texels is None else _surface_arrays(f"{index}_texels_", container.texels)
+    arrays |= {f"{index}_links": flatten_links(container.links) for index, container in enumerate(
+        result.objects.values()) if container.links is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -149,7 +175,13 @@ def read_result(folder: Path) -> BakeResult:
         cloud = read_cloud(check_header(header, name), arrays.get(f"{index}_cloud"), name)
         lamps = read_lamp_surfaces(header, *(arrays.get(f"{index}_{part}") for part in _LAMP_ARRAYS), len(parts[0]),
                                    name, REBAKE)
-        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps)
+        live = LiveOperator.of_arrays({part: arrays[f"{index}_live_{part}"] for part in _LIVE_ARRAYS}) \
+            if f"{index}_live_counts" in arrays else None
+        atlas = header.get(ATLAS_ENTRY)
+        texels = None if atlas is None else _surface(f"{index}_texels_", arrays, {k: atlas[k] for k in NUMBERS})
+        links = read_links(header, arrays.get(f"{index}_links"), len(parts[0]), name, REBAKE)
+        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps, live=live,
+                                  texels=texels, links=links)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

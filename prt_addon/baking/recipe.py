@@ -8,7 +8,7 @@ later run of the same job starts after the last one.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
 from dataclasses import dataclass, field, fields, replace
@@ -49,6 +49,7 @@ from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, Indirect
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
 from ..transport.texel_visibility import TexelVisibility
+from .basis_choice import BasisChoice, choose_basis
 from .cubemap import bounced_cubemap, by_point, cubemap_signal, direct_cubemap, is_kept, without_scale
 from .distant_basis import distant_basis
 from .error_budget import BakedSample, choose_receivers, error_budget
@@ -56,6 +57,8 @@ from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
 from .lit_highlights import LitHighlights
+from .live_editing import kept_factors, with_live_editing
+from .live_links import with_subsurface_links
 from .local_budget import local_budget
 from .local_highlight_budget import local_highlight_budget
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
@@ -70,7 +73,9 @@ from .results import (
     surface_checks,
     white_world_checks,
 )
+from .sampling import SampledDirect, can_start_dense, dense_points, encode_from_dense, sampling_checks
 from .settings import EIGENTRANSPORT, BakeSettings
+from .sparse_choice import note_sparse
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .texel_highlights import (
     columns_through_bodies,
@@ -115,16 +120,19 @@ Steps = Generator[Progress, None, Any]
 
 def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
          light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
-         regions: NDArray[np.float64] | None = None) -> Generator[Progress, None, BakeResult]:
+         regions: NDArray[np.float64] | None = None,
+         make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress, None, BakeResult]:
     """Yield progress and return the result.
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
-    scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    scene's free space). make_tracer: of points, triangles, a number of threads and the surface of texels (None:
+    none). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
+    settings, choice = choose_basis(scene, settings, light)
     settings = transport_settings(settings)
     regions = np.empty((0, 4, 4)) if regions is None else regions
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions).run())
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice, make_tracer).run())
 
 
 def transport_settings(settings: BakeSettings) -> BakeSettings:
@@ -147,11 +155,15 @@ class _Bake:
     light: ReferenceLight | None
     digests: dict[str, str]
     regions: NDArray[np.float64]
+    choice: BasisChoice | None = None
+    make_tracer: Callable[..., Tracer] = Tracer
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
     point_errors: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    dense: NDArray[np.bool_] | None = None
+    sampling: dict[str, Any] = field(default_factory=dict)
     buried: NDArray[np.int64] | None = None
     local: LocalTransfer | None = None
     local_scale: float = 1.0
@@ -188,6 +200,7 @@ class _Bake:
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
+        self.kept_factors = kept_factors(gathered, self.albedo, self.basis.white(transfer), self.settings)
         glossy, subsurface = None, []
         if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
@@ -288,7 +301,7 @@ class _Bake:
 
     def _prepare(self) -> None:
         settings = self.settings
-        self.tracer = Tracer(self.scene.points, self.scene.triangles, settings.threads)
+        self.tracer = self.make_tracer(*self.scene.shape, settings.threads, self.scene.traced)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
@@ -332,6 +345,8 @@ class _Bake:
         stored = self._load("direct")
         if stored is not None:
             found = stored[0]
+            if self.basis.cubemap:
+                self._sampled(receivers, SampledDirect.unpacked(*stored))
             visibility = VisibilityCoefficients(found["rows"], found["visible"], found.get("blocked")) \
                 if "rows" in found else None
             return receivers, found["transfer"], visibility
@@ -340,9 +355,11 @@ class _Bake:
         chosen = front & self.glossy[receivers.key % len(self.scene.points)]
         if self.basis.cubemap:
             plain = texel_visibility(chosen, self.basis, self.settings, gathered is not None)
-            transfer = yield from self._follow("direct", direct_cubemap(
-                self.tracer, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.folder, plain))
-            return receivers, transfer, self._visibility(receivers, transfer, plain)
+            sampled = yield from self._follow("direct", direct_cubemap(
+                self.tracer, self.scene, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.light,
+                self.folder, plain))
+            transfer = self._sampled(receivers, sampled)
+            return receivers, transfer, self._visibility(receivers, transfer, plain, *sampled.kept())
         if chosen.any():
             plain = HemisphereVisibility(chosen, INCIDENT_ORDER + order - 1, INCIDENT_ORDER if gathered else 0)
         transfer = yield from self._follow("direct", direct_transfer(
@@ -351,13 +368,20 @@ class _Bake:
         return receivers, transfer, self._visibility(receivers, transfer, plain)
 
     def _visibility(self, receivers: ReceiverSet, transfer: NDArray[np.float32],
-                    plain: HemisphereVisibility | TexelVisibility | None) -> VisibilityCoefficients | None:
+                    plain: HemisphereVisibility | TexelVisibility | None, arrays: dict[str, NDArray] | None = None,
+                    header: dict[str, Any] | None = None) -> VisibilityCoefficients | None:
         """What was collected for highlights, once the stage is kept."""
         visibility = plain.result(receivers.normals) if plain else None
         extra = {name: value for name, value in vars(visibility).items() if value is not None} if visibility else {}
         if is_kept(transfer, self.settings) or not self.basis.cubemap:
-            self._save("direct", {"transfer": transfer, **extra})
+            self._save("direct", {"transfer": transfer, **extra, **(arrays or {})}, header)
         return visibility
+
+    def _sampled(self, receivers: ReceiverSet, found: SampledDirect) -> NDArray[np.float32]:
+        """Keep what the report tells of how direct light was sampled, and which points the encoder starts from."""
+        self.dense, self.sampling = dense_points(self.scene, receivers, found.dense), found.facts
+        note_sparse(self.plan.needs, found.left_out)
+        return found.transfer
 
     def _glossy(self, receivers: ReceiverSet, transfer: NDArray[np.float32], visibility: VisibilityCoefficients,
                 gathered: Gather | None) -> Generator[Progress, None, GlossyRows]:
@@ -662,6 +686,10 @@ class _Bake:
         if self.local is None and self.settings.encoder == EIGENTRANSPORT and metric is None:
             encoding = eigentransport(signal, settings.vectors, target_error=settings.target_error,
                                       seed=settings.seed, progress=state.report).encoding
+        elif self.local is None and self.dense is not None and metric is None and can_start_dense(
+                dense := self.dense[target.points][~self.scene.loose[target.points]], settings.method):
+            positions = self.scene.points[target.points][~self.scene.loose[target.points]]
+            encoding = encode_from_dense(signal, dense, positions, settings, state.report)
         elif self.local is None:
             encoding = encode(signal, settings, metric, state.report)
         else:
@@ -778,12 +806,15 @@ class _Bake:
                 bodies: list[BodyLight]) -> BakeResult:
         """errors: the budget of diffuse light and that of highlights."""
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings, self.basis)
-        stability += surface_checks(self.surfaces, bodies)
+        stability += surface_checks(self.surfaces, bodies) + sampling_checks(self.sampling)
         if self.settings.distant_light:
             stability += white_world_checks(self._white_worlds(encodings))
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
+        report["basis"] = self.basis.words if self.settings.distant_light else ""
+        report["choice"] = None if self.choice is None else self.choice.facts
+        report["tracer"] = self.tracer.facts
         if self.local is not None:
             report["local"] = self.local.facts
             report["local_errors"] = self.local_errors
@@ -794,6 +825,7 @@ class _Bake:
             if self.local_errors:
                 report["covers"] += lamps_covered(self.local_highlight_errors)
             report["scene"]["warnings"] += self.local.facts["warnings"]
+        report["sampling"] = self.sampling
         if self.memory_warning:
             report["scene"]["warnings"].append(f"Bake: {self.memory_warning}")
         if self.filled:
@@ -811,6 +843,11 @@ class _Bake:
         if self.local is not None:
             objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
                        for target in self.targets}
+            objects = {target.name: with_subsurface_links(objects[target.name], self.scene, target,
+                                                          self.settings.subsurface_links, self.tracer.threads)
+                       for target in self.targets}
+        objects, report["live_editing"] = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces,
+                                                            self.albedo, self.buried)
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:

@@ -20,9 +20,12 @@ from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
 from ..scene.needs import LeftOut
 from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..scene.texel_surface import TexelSurface
 from ..storage.columns import columns_entry, surfaces_entry
 from ..storage.container import CONSTANT_ROWS, BakedTransfer, hemisphere_rows, make_header
 from ..storage.digests import digest_json
+from ..storage.texels import ENTRY as ATLAS_ENTRY
+from ..storage.texels import atlas_entry
 from ..transport.gather import Gather
 from ..transport.interreflection import LARGEST_ALBEDO, Interreflection
 from .distant_basis import DistantBasis, distant_basis
@@ -67,6 +70,7 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
     else:
         columns = local.entry(basis if settings.distant_light else DistantBasis(0))
         bases[:, :, :, shape[1] - local.cloud.columns:] /= np.float32(local.scale)
+    texels = _texels_of(scene, target)
     header = make_header(
         bases.shape,
         columns,
@@ -86,6 +90,7 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
                     if target.name in (errors := object_errors(report, part))},
         coherence=report["clusters"]["objects"][target.name].get("coherence"),
         seconds=report["seconds"],
+        **({} if texels is None else {ATLAS_ENTRY: atlas_entry(texels)}),
     )
     points = target.points
     triangles = (scene.triangles[target.triangles] - points.start).astype(np.int32)
@@ -94,7 +99,13 @@ def object_container(scene: SceneMesh, target: SceneObject, encoding: Encoding, 
                          scene.points[points].astype(np.float32), scene.normals[points].astype(np.float32), triangles,
                          scene.tangents[points].astype(np.float32) if len(functions) else None,
                          None if local is None else local.cloud,
-                         source=None if scene.source is None else scene.source[target.triangles], error=point_error)
+                         source=None if scene.source is None else scene.source[target.triangles], error=point_error,
+                         texels=texels)
+
+
+def _texels_of(scene: SceneMesh, target: SceneObject) -> TexelSurface | None:
+    """The surface under a target's texels; None where its points are vertices."""
+    return dict(zip((o.name for o in scene.objects), scene.surfaces, strict=False)).get(target.name)
 
 
 @dataclass(frozen=True)

@@ -158,22 +158,23 @@ def surface_textures(scene_object: bpy.types.Object, baked: BakedTransfer, depsg
     """Textures of an object's baked triangles; None where no material shows an image through a UV map, or where the
     bake does not know its source triangles or these are no more those of the object."""
     placed_now = np.array(scene_object.matrix_world, np.float64)
-    if baked.source is None or is_flattened(placed_now) or not any(
+    positions, triangles, of_triangle = baked.drawn
+    if of_triangle is None or is_flattened(placed_now) or not any(
             texture_of(slot.material) for slot in scene_object.material_slots):
         return None
     parts = _placed_parts(scene_object, depsgraph)
     source = [np.concatenate(arrays) for arrays in zip(*[part[:3] for part in parts], strict=True)] if parts else None
-    if source is None or len(baked.source) == 0 or int(baked.source.max()) >= len(source[0]):
+    if source is None or len(of_triangle) == 0 or int(of_triangle.max()) >= len(source[0]):
         return None
     corners, places, number = source
     uses, number = _joined_uses([part[3] for part in parts], [len(part[0]) for part in parts], number)
-    use = number[baked.source]
+    use = number[of_triangle]
     if not (use >= 0).any():
         return None
     matrix = np.array(baked.header["matrix"], np.float64).reshape(4, 4)
     inverse = np.linalg.inv(matrix)  # small
-    local = transform_rows(baked.positions, inverse[:3, :3]) + inverse[:3, 3]
-    found = places_on_parts(local[baked.triangles], baked.source, corners, places)
+    local = transform_rows(positions, inverse[:3, :3]) + inverse[:3, 3]
+    found = places_on_parts(local[triangles], of_triangle, corners, places)
     return SurfaceTextures(uses, use, found, (uses, digest_arrays(use, found)))
 
 

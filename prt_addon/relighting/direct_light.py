@@ -79,11 +79,13 @@ class LitReceivers:
         return LitReceivers(origins, _by_axis(origins), _by_axis(normals))
 
     @staticmethod
-    def of_mesh(tracer: Tracer, positions: ArrayLike, normals: ArrayLike, triangles: NDArray[np.int32]) -> LitReceivers:
+    def of_mesh(tracer: Tracer, positions: ArrayLike, normals: ArrayLike, triangles: NDArray[np.int32],
+                faces: NDArray[np.floating] | None = None) -> LitReceivers:
         """The same for the vertices of triangles (t, 3): pulled into their faces as in the bake, or the corners of a
-        room would be dark."""
+        room would be dark. faces: (p, 3) of texels, see `ray_origins`."""
         normals = np.asarray(normals, np.float64)
-        starts = ray_origins(np.asarray(positions, np.float64), normals, triangles, tracer.diagonal)
+        starts = ray_origins(np.asarray(positions, np.float64), normals, triangles, tracer.diagonal,
+                             faces=faces)
         origins = tracer.to_tracing_space(starts)
         return LitReceivers(origins, _by_axis(origins), _by_axis(normals))
 

@@ -102,10 +102,11 @@ def is_lone_convex(scene: SceneMesh) -> bool:
     A closed connected surface that is convex at every edge is convex as a whole (Tietze-Nakajima), so only neighbours
     are compared. Split points (equal positions) count as one.
     """
-    if not len(scene.triangles) or _surely_not_convex(scene):
+    points, triangles = scene.shape
+    if not len(triangles) or _surely_not_convex(points, triangles):
         return False
-    positions, place = np.unique(scene.points, axis=0, return_inverse=True)
-    triangles = place.reshape(-1)[scene.triangles]
+    positions, place = np.unique(points, axis=0, return_inverse=True)
+    triangles = place.reshape(-1)[triangles]
     corners = positions[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
@@ -118,11 +119,11 @@ def is_lone_convex(scene: SceneMesh) -> bool:
     return _closed_convex(positions, triangles, normal, slack)
 
 
-def _surely_not_convex(scene: SceneMesh) -> bool:
+def _surely_not_convex(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bool:
     """A cheap look at evenly spaced points and triangles that spares nearly every scene the full test."""
-    used = np.unique(scene.triangles)
-    points = scene.points[used[:: max(1, len(used) // 64)]]
-    corners = scene.points[scene.triangles[:: max(1, len(scene.triangles) // 2048)]]
+    used = np.unique(triangles)
+    corners = points[triangles[:: max(1, len(triangles) // 2048)]]
+    points = points[used[:: max(1, len(used) // 64)]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
     height = sum(points[:, None, axis] * normal[None, :, axis] for axis in range(3))

@@ -21,11 +21,11 @@ HIGHEST = 0.25
 
 
 def ray_origins(points: NDArray[np.float64], normals: NDArray[np.float64], triangles: NDArray[np.int32],
-                diagonal: float, side: int = 1) -> NDArray[np.float64]:
+                diagonal: float, side: int = 1, faces: NDArray[np.floating] | None = None) -> NDArray[np.float64]:
     """Ray origins (p, 3) float64 of all points: pulled into their faces and lifted above them.
 
     side: 1 for the front of the surface, -1 for its back. diagonal: of the whole scene, metres. Loose points only
-    get the lift.
+    get the lift. faces: (p, 3) unit normal of the one face that a texel lies on, zero for vertices; None: all are.
     """
     count = len(points)
     corners = points[triangles]
@@ -50,15 +50,22 @@ def ray_origins(points: NDArray[np.float64], normals: NDArray[np.float64], trian
     # Where a spike's faces ask for more, the shading normal says nothing about the surface: stay near the vertex.
     reach = np.sqrt(np.sum(shift ** 2, axis=1)) * (HIGHEST / PULL)
     height = np.minimum(height, np.maximum(reach, lift))
+    if faces is not None:
+        # A texel's triangles join it to others, not always along its face: only what they say along it counts.
+        texel = faces.any(axis=1)
+        own = side * faces[texel]
+        shift[texel] -= np.sum(shift[texel] * own, axis=1, keepdims=True) * own
+        height[texel] = lift / np.maximum(np.sum(own * upward[texel], axis=1), STEEPEST)
     return points + shift + height[:, None] * upward
 
 
 def adjacent_faces(points: NDArray[np.float64], triangles: NDArray[np.int32],
-                   ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+                   own: NDArray[np.floating] | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Unit normals (p, k, 3) of each point's faces and their weights (p, k) by angle, of sum 1 (0: no face).
 
-    k is the largest number of faces at a point, at most MOST_FACES; of more, evenly spaced ones stand for all. By
-    angle, because a quad must count the same whichever way it was cut.
+    own: as `faces` of `ray_origins`: a texel has this one alone. k is the largest number of faces at a point, at most
+    MOST_FACES; of more, evenly spaced ones stand for all. By angle, because a quad must count the same whichever way it
+    was cut.
     """
     corners = points[triangles]
     edges = np.roll(corners, -1, axis=1) - corners
@@ -79,6 +86,10 @@ def adjacent_faces(points: NDArray[np.float64], triangles: NDArray[np.int32],
     place = owner[order][first], slot[first]
     normals[place] = face[order[first] // 3]
     weights[place] = angle[order[first]]
+    if own is not None:
+        texel = own.any(axis=1)
+        normals[texel], weights[texel] = 0.0, 0.0
+        normals[texel, 0], weights[texel, 0] = own[texel], 1.0
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
     return normals, weights
 

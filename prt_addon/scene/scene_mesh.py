@@ -9,6 +9,7 @@ refined. Nothing in later stages has to know about vertices, corners or objects 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from .orientation import outward
 from .refinement import Beside, EdgeLimit, refine
 from .surface_material import DIFFUSE, SurfaceMaterial
 from .tangents import UP, quiet_pole, smooth_tangents, tangent_frame
+from .texel_receivers import TexelChoice, texel_part, wants_texels
+from .texel_surface import TexelSurface, TracedSurface
 
 # Corners of one vertex whose normals differ by less than 0.25 degrees, or albedos by less than half an 8-bit step, are
 # one receiver: below what interpolation shows, above the noise of Blender's packed custom normals.
@@ -55,6 +58,8 @@ class SceneMesh:
     material: (p,) int32 into materials; tangents: (p, 3) float64, unit, orthogonal to the normals; materials: each
     once (names aside), the first always DIFFUSE, which stands for all that only reflect diffusely;
     source: (t,) int32, which of its object's triangles, as they were read, each one is or is a part of;
+    faces: (p, 3) float64 unit normal of the one triangle that a texel lies on, zero for vertices; None where there are
+    no texels; surfaces: of each object, None for those whose points are vertices; () where all are;
     warnings: what was dropped or repaired, one line each.
     """
 
@@ -69,6 +74,31 @@ class SceneMesh:
     materials: tuple[SurfaceMaterial, ...] = (DIFFUSE,)
     warnings: tuple[str, ...] = ()
     source: NDArray[np.int32] | None = None
+    faces: NDArray[np.float64] | None = None
+    surfaces: tuple[TexelSurface | None, ...] = ()
+
+    @cached_property
+    def traced(self) -> TracedSurface | None:
+        """What rays meet where some points are texels; None where it is the scene's own triangles."""
+        if not any(self.surfaces):
+            return None
+        points, triangles, first = [], [], 0
+        for scene_object, surface in zip(self.objects, self.surfaces, strict=True):
+            own = self.points[scene_object.points] if surface is None else surface.points
+            faces = (self.triangles[scene_object.triangles] - scene_object.points.start if surface is None else
+                     surface.triangles)
+            points.append(own)
+            triangles.append(faces + first)
+            first += len(own)
+        counts = [len(faces) for faces in triangles]
+        return TracedSurface(np.concatenate(points), np.concatenate(triangles).astype(np.int32),
+                             np.concatenate([[0], np.cumsum(counts)]),
+                             np.array([o.triangles.start for o in self.objects] + [len(self.triangles)]), self.surfaces)
+
+    @property
+    def shape(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Points and triangles of the true surface."""
+        return (self.points, self.triangles) if self.traced is None else (self.traced.points, self.traced.triangles)
 
     @property
     def size(self) -> float:
@@ -76,13 +106,15 @@ class SceneMesh:
         return bounding_diagonal([self.points[o.points] for o in self.objects if o.is_target])
 
     @staticmethod
-    def assemble(objects: list[ObjectMesh], spacing: float = 0.0,
-                 lamps: NDArray[np.float64] | None = None) -> SceneMesh:
+    def assemble(objects: list[ObjectMesh], spacing: float = 0.0, lamps: NDArray[np.float64] | None = None,
+                 texels: TexelChoice | None = None, split_slots: bool = False) -> SceneMesh:
         """Join objects into one scene.
 
         spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal, and beyond
         that diagonal of the distance from them; 0 keeps the meshes as they are. lamps: (n, 3) places inside rooms,
-        which stay wound inwards. Raises BadScene, naming the object, where nothing can be baked.
+        which stay wound inwards. texels: which targets get texels as receivers, so far apart (None: none). split_slots:
+        a point belongs to one material slot, even where two slots look the same, so that one can be changed later.
+        Raises BadScene, naming the object, where nothing can be baked.
         """
         if not any(o.is_target for o in objects):
             raise BadScene("scene", "no mesh object to bake", "Select a mesh object, or make one visible in renders")
@@ -96,7 +128,8 @@ class SceneMesh:
             raise BadScene(name, "all vertices lie in one point", "Give the object a size")
         limit = EdgeLimit(spacing * diagonal, targets.min(axis=0), targets.max(axis=0))
         materials, numbers = _number_materials(cleaned)
-        parts = [_split(o, of_triangle, limit, warnings) for o, of_triangle in zip(cleaned, numbers, strict=True)]
+        parts = [_split(o, of_triangle, limit, warnings, texels if o.is_target else None, split_slots)
+                 for o, of_triangle in zip(cleaned, numbers, strict=True)]
         return _join(cleaned, parts, materials, tuple(warnings))
 
 
@@ -112,6 +145,7 @@ class _Part:
     tangents: NDArray[np.float64]
     matches_source: bool
     source: NDArray[np.int32]
+    surface: TexelSurface | None = None
 
 
 def _number_materials(objects: list[ObjectMesh]) -> tuple[tuple[SurfaceMaterial, ...], list[NDArray[np.int32]]]:
@@ -175,13 +209,17 @@ def _corner_groups(mesh: ObjectMesh, material: NDArray[np.int32], tangent: NDArr
     return group, count
 
 
-def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warnings: list[str]) -> _Part:
-    """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined.
+def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warnings: list[str],
+           texels: TexelChoice | None = None, split_slots: bool = False) -> _Part:
+    """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined, or get texels.
 
     material: (t,) number of each triangle's.
     """
     tangent = _unit_corner_tangents(mesh)
-    group, count = _corner_groups(mesh, material, tangent)
+    apart = material
+    if split_slots and mesh.material_index is not None:
+        apart = material * np.int32(len(mesh.materials) + 1) + mesh.material_index.astype(np.int32)
+    group, count = _corner_groups(mesh, apart, tangent)
     points = np.empty((count, 3))
     points[:len(mesh.positions)] = mesh.positions
     points[group] = mesh.positions[mesh.triangles.ravel()]
@@ -198,17 +236,31 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
         wanted = _mean_per_group(mesh.corner_tangents.reshape(-1, 3), group, count)
         beside.tangents = tangent_frame(wanted, normals, quiet_pole(normals))
     matches = count == len(mesh.positions)
+    if texels is not None:
+        whole = _Part(points, normals, albedo.astype(np.float32), triangles, beside.material,
+                      _point_tangents(beside, normals), False, beside.source)
+        if wants_texels(texels, whole, limit.longest):
+            made = texel_part(mesh.name, texels, whole, limit.longest)
+            warnings.append(f"{mesh.name}: {len(made.points)} texels in {made.surface.charts} charts of an atlas of"
+                            f" {made.surface.width} x {made.surface.height}")
+            return _Part(made.points, made.normals, made.albedo, made.triangles, made.material, made.tangents, False,
+                         made.source, made.surface)
     if limit.longest > 0.0:
         before = len(points)
         points, normals, albedo, triangles = refine(points, normals, albedo, triangles, limit, mesh.name, beside)
         if len(points) != before:
             matches = False
             warnings.append(f"{mesh.name}: refined from {before} to {len(points)} receivers")
-    tangents = beside.tangents
-    if tangents is None:  # of diffuse points nobody asks
-        tangents = smooth_tangents(normals, quiet_pole(normals) if beside.material.any() else UP)
-    return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material, tangents, matches,
-                 beside.source)
+    return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material,
+                 _point_tangents(beside, normals), matches, beside.source)
+
+
+def _point_tangents(beside: Beside, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The tangents that were asked for, else smooth ones."""
+    if beside.tangents is not None:
+        return beside.tangents
+    # Of diffuse points nobody asks.
+    return smooth_tangents(normals, quiet_pole(normals) if beside.material.any() else UP)
 
 
 def _unit_corner_tangents(mesh: ObjectMesh) -> NDArray[np.float64] | None:
@@ -261,5 +313,17 @@ def _join(objects: list[ObjectMesh], parts: list[_Part], materials: tuple[Surfac
     points, normals, albedo, material, tangents, source = (
         np.concatenate([getattr(p, name) for p in parts])
         for name in ("points", "normals", "albedo", "material", "tangents", "source"))
-    return SceneMesh(points, normals, joined, albedo, loose, material, tangents, tuple(scene_objects), materials,
-                     warnings, source)
+    scene = SceneMesh(points, normals, joined, albedo, loose, material, tangents, tuple(scene_objects), materials,
+                      warnings, source)
+    return with_surfaces(scene, tuple(part.surface for part in parts))
+
+
+def with_surfaces(scene: SceneMesh, surfaces: tuple[TexelSurface | None, ...]) -> SceneMesh:
+    """The scene, whose points are texels of these surfaces of its objects; itself where there are none."""
+    if not any(surfaces):
+        return scene
+    faces = np.zeros_like(scene.points)
+    for scene_object, surface in zip(scene.objects, surfaces, strict=True):
+        if surface is not None:
+            faces[scene_object.points] = surface.faces
+    return replace(scene, faces=faces, surfaces=surfaces)

@@ -183,9 +183,12 @@ def face_shares(scene: SceneMesh) -> NDArray[np.float32]:
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
     left = 0.5 * (1.0 + np.sum(scene.normals[scene.triangles] * face[:, None, :], axis=2))
-    faces, weights = adjacent_faces(scene.points, scene.triangles)
+    faces, weights = adjacent_faces(scene.points, scene.triangles, scene.faces)
     mean = np.sum(weights * 0.5 * (1.0 + np.sum(faces * scene.normals[:, None, :], axis=2)), axis=1)
-    return (left / np.maximum(mean, 1e-3)[scene.triangles]).astype(np.float32)
+    shares = (left / np.maximum(mean, 1e-3)[scene.triangles]).astype(np.float32)
+    if scene.faces is not None:  # a texel has one face, whatever triangles join it to others
+        shares[scene.faces.any(axis=1)[scene.triangles]] = 1.0
+    return shares
 
 
 def _tasks(receivers: ReceiverSet, directions: NDArray[np.float64], weights: NDArray[np.float64], group: int,
@@ -209,9 +212,8 @@ def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task)
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
     cosines = facing_cosines(task.directions, receivers.normals[place])
-    which, row = np.nonzero(cosines > 0.0)
+    which, row, hits = tracer.nearest_where(receivers.origins[place], task.directions, cosines > 0.0)
     rays = len(row)
-    hits = tracer.nearest(np.take(receivers.origins[place], row, axis=0), np.take(task.directions, which, axis=0))
     met = np.flatnonzero(hits.triangle >= 0)
     which, row = which[met], row[met]
     share = cosines[which, row]

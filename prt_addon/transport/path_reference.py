@@ -211,13 +211,17 @@ def surface_at(tracer: Tracer, scene: SceneMesh, hits: Hits, met: NDArray[np.int
     corner = scene.triangles[hits.triangle[met]]
     u, v = hits.u[met].astype(np.float64), hits.v[met].astype(np.float64)
     weights = np.stack([1.0 - u - v, u, v], axis=1)[:, :, None]
-    places = scene.points[corner]
-    face = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
-    face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
+    if hits.traced is not None:
+        place, face = tracer.surface.places(*(values[met] for values in hits.traced))
+    else:
+        places = scene.points[corner]
+        face = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+        face /= np.maximum(np.sqrt(np.sum(face ** 2, axis=1, keepdims=True)), np.finfo(np.float64).tiny)
+        place = np.sum(weights * places, axis=1)
     side = np.where(hits.front[met], 1.0, -1.0)[:, None]
     normal = np.sum(weights * scene.normals[corner], axis=1)
     normal /= np.maximum(np.sqrt(np.sum(normal ** 2, axis=1, keepdims=True)), 1e-12)
-    origin = np.sum(weights * places, axis=1) + side * face * (HIT_LIFT * LIFT * tracer.diagonal)
+    origin = place + side * face * (HIT_LIFT * LIFT * tracer.diagonal)
     return HitSurface(corner, weights, tracer.to_tracing_space(origin), side * normal, side * face, side[:, 0])
 
 

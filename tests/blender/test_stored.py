@@ -387,7 +387,7 @@ def _set_header(mesh: bpy.types.Mesh, **changes: object) -> None:
 
 
 DAMAGE = {
-    "newer schema": (lambda m: _set_header(m, schema=5), "schema 5"),
+    "newer schema": (lambda m: _set_header(m, schema=6), "schema 6"),
     "no json": (lambda m: m.__setitem__("prt_header", "{"), "not readable"),
     "lost attribute": (lambda m: m.attributes.remove(m.attributes["prt_weights_1"]), "prt_weights_1"),
     "lost bases": (lambda m: m.__delitem__("prt_bases"), "no bases"),
@@ -408,7 +408,7 @@ def test_damaged_or_newer_data_is_refused(scene: bpy.types.Scene, damage: str) -
         stored.read_baked(sphere)
     assert caught.value.subject == "Sphere"
     if damage == "newer schema":
-        with pytest.raises(StorageError, match="schema 5"):
+        with pytest.raises(StorageError, match="schema 6"):
             stored.stale(sphere, depsgraph())
     assert stored.clear_baked(sphere)
 

@@ -24,7 +24,7 @@ EVERYWHERE = {"numpy", "scipy"}
 BLENDER = {"bpy", "blf", "imbuf", "mathutils", "bmesh", "bpy_extras", "addon_utils", "idprop"}
 GPU = {"gpu", "gpu_extras"}
 # Wheel -> the folders that may import it, lazily.
-WHEELS = {"embreex": ("prt_addon/tracing/",), "xatlas": ("prt_addon/scene/receivers",),
+WHEELS = {"embreex": ("prt_addon/tracing/",), "xatlas": ("prt_addon/scene/unwrap_process",),
           "OpenEXR": ("prt_addon/storage/", "prt_addon/lighting/")}
 THREADS = {"threading", "_thread", "concurrent", "multiprocessing", "asyncio"}
 # These run in Blender's own process, where extensions may not start threads; the rest of the core runs in the child.
