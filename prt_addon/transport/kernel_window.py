@@ -4,7 +4,7 @@
 Light in spherical harmonics is cut at its own order, and its own window takes care of what rings. A texel's light is as
 sharp as the texel, and what is cut then are the rows: a few smooth functions of the view follow a narrow highlight with
 swings to both sides, black spots on a metal beside the sun's reflection. As rows of lamps (`lamp_kernel`), K is damped,
-band by band of the incident functions, by the weakest heat kernel that leaves no lobe below -DEEPEST_LOBE of the peak.
+band by band of the incident functions, by the weakest heat kernel that leaves no lobe below -DEEPEST_LOBE of the peak, or hardly deeper ones than any leaves.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from .lamp_kernel import DEEPEST_LOBE, profile_directions
 
 Array = NDArray[np.float64]
 
-_HALVINGS, _STRONGEST = 12, 0.1
+# Strengths that are tried, up to that of lamps. Rows ring by themselves in some views, which no softer light mends: a
+# stronger one that gains less than ENOUGH of the peak is not taken.
+_STRENGTHS, ENOUGH = np.linspace(0.0, 0.05, 26), 0.01
 
 
 def softened(kernel: Array, functions: Indices) -> tuple[Array, float]:
@@ -41,14 +43,12 @@ def softened(kernel: Array, functions: Indices) -> tuple[Array, float]:
         missing = whole - np.sum(result * white[:, None], axis=1)
         return result + missing[:, None] * (white / np.sum(white ** 2))[:, None]
 
-    def rings(strength: float) -> bool:
+    def depth(strength: float) -> float:
         profile = multiply(multiply(seen, np.ascontiguousarray(damped(strength).mean(axis=2))), values)
-        return bool(np.any(profile.min(axis=1) < -DEEPEST_LOBE * profile.max(axis=1)))
+        return float(np.max(-profile.min(axis=1) / profile.max(axis=1)))
 
-    if not rings(0.0):
+    depths = np.array([depth(strength) for strength in _STRENGTHS])
+    chosen = float(_STRENGTHS[np.flatnonzero(depths <= max(DEEPEST_LOBE, depths.min() + ENOUGH))[0]])
+    if chosen == 0.0:
         return kernel, 1.0
-    low, high = 0.0, _STRONGEST
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if rings(middle) else (low, middle)
-    return damped(high), float(spherical_harmonics.window(order, "heat", high)[-1])
+    return damped(chosen), float(spherical_harmonics.window(order, "heat", chosen)[-1])
