@@ -4,7 +4,8 @@
 Light in spherical harmonics is cut at its own order, and its own window takes care of what rings. A texel's light is as
 sharp as the texel, and what is cut then are the rows: a few smooth functions of the view follow a narrow highlight with
 swings to both sides, black spots on a metal beside the sun's reflection. As rows of lamps (`lamp_kernel`), K is damped,
-band by band of the incident functions, by the weakest heat kernel that leaves no lobe below -DEEPEST_LOBE of the peak, or hardly deeper ones than any leaves.
+band by band of the incident functions, by the weakest heat kernel that leaves no lobe below -DEEPEST_LOBE of the peak,
+or hardly deeper ones than any leaves.
 """
 
 from __future__ import annotations
