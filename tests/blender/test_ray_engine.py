@@ -222,16 +222,20 @@ def test_both_sides_share_the_work_and_keep_its_order(device):
 
     def work(k: int) -> np.ndarray:
         wheres.append(threading.get_ident())
-        part = slice(4096 * k, 4096 * (k + 1))
-        return mixed.occluded(origins[part], directions[:1])
+        return mixed.occluded_where(origins[4096 * k:4096 * (k + 1)], directions[:1], np.ones((1, 4096), bool))[0]
     found = list(mixed.map_in_order(work, range(8)))
     assert [k for k, _ in found] == list(range(8))
     assert (np.concatenate([hit for _, hit in found]) != alone.occluded(origins, directions[:1])).sum() <= 2
     assert len(set(wheres)) == 2 and 0 < mixed.gpu_rays < len(origins)
     assert mixed.gpu_rays == 4096 * wheres.count(threading.get_ident())
-    few = mixed.gpu_rays
-    mixed.nearest(origins[:LEAST_RAYS - 1], directions[:1])  # not worth a dispatch
-    assert mixed.gpu_rays == few and mixed.facts["gpu_rays"] == few
+    known = mixed.gpu_rays
+    few = np.ones((1, LEAST_RAYS - 1), bool)
+    mixed.occluded_where(origins[:LEAST_RAYS - 1], directions[:1], few)  # not worth a dispatch
+    mixed.nearest(origins, directions[:1])  # sent one by one Embree is faster
+    assert mixed.gpu_rays == known and mixed.facts["gpu_rays"] == known
+    which, row, hits = mixed.nearest_where(origins[:3000], directions[:2], np.ones((2, 3000), bool))
+    assert mixed.gpu_rays == known + 6000 and np.array_equal(which * 3000 + row, np.arange(6000))
+    assert_agree(hits, alone.nearest(origins[row], directions[which]), 2)
     closed = mixed.map_in_order(work, range(1000))
     next(closed)
     before = len(wheres)
