@@ -40,6 +40,7 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         distant = column.column()
         distant.active = settings.lighting != "local"
         if settings.distant_basis != "sh":
+            distant.prop(settings, "sampling")
             distant.prop(settings, "memory_budget")
         if settings.distant_basis == "sh":
             distant.prop(settings, "fit_order_to_light")

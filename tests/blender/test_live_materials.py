@@ -186,7 +186,7 @@ def test_form_factors_survive_a_file_and_go_with_the_bake(room, tmp_path: Path) 
     for name, values in kept.arrays().items():
         assert np.array_equal(again.arrays()[name], values), name
     stored.clear_baked(floor)
-    assert not any(key.startswith("prt_live") for mesh in bpy.data.meshes for key in mesh)
+    assert not any(key in mesh for mesh in bpy.data.meshes for key in live_materials.PROPERTIES.values())
 
 
 def test_broken_form_factors_are_told_and_the_bake_is_still_shown(room) -> None:

@@ -122,7 +122,7 @@ def in_time() -> Step:
         for step in range(EDITS):
             drawn.clear()
             count, edited = materials().answers, time.perf_counter()
-            inputs("Left")["Base Color"].default_value = (0.05 + 0.08 * step, 0.6 - 0.06 * step, 0.05, 1.0)
+            inputs("Left")["Base Color"].default_value = (0.1 + 0.08 * step, 0.55 - 0.06 * step, 0.05, 1.0)
             yield from until(lambda count=count: any(number > count for number, _ in drawn), "no picture follows")
             answers.append(materials().seconds)
             pictures.append(next(moment for number, moment in drawn if number > count) - edited)
