@@ -30,7 +30,8 @@ LEAST_RAYS = 2048  # fewer are traced by Embree before a dispatch has begun
 
 
 class MixedTracer(Tracer):
-    """A Tracer whose maker's thread uses a graphics device for blocks of rays. device: see ray_engine.RayDevice; gpu_rays: traced on it.
+    """A Tracer whose maker's thread uses a graphics device for blocks of rays. device: see ray_engine.RayDevice;
+    gpu_rays: traced on it.
 
     Raises PRTError for a scene that the device can't hold.
     """
@@ -72,7 +73,7 @@ class MixedTracer(Tracer):
             return super().nearest_where(origins, directions, asked)
         codes = np.flatnonzero(asked)
         which, row = np.divmod(codes, len(origins))
-        return which, row, self._engine.nearest_pairs(origins, directions, codes)
+        return which, row, self._named(self._engine.nearest_pairs(origins, directions, codes))
 
     def _where_on_device(self, asked: NDArray[np.bool_]) -> bool:
         """Whether the device traces what is asked for, which is counted then."""

@@ -14,6 +14,7 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 
 # isort: split
 from prt.prt_addon.errors import PRTError
+from prt.prt_addon.scene.texel_surface import TracedSurface
 from prt.prt_addon.tracing.mixed_tracer import LEAST_RAYS, MixedTracer
 from prt.prt_addon.tracing.ray_calibration import ball_field, calibrate, field_rays
 from prt.prt_addon.tracing.ray_cost import choose_tracer
@@ -241,6 +242,21 @@ def test_both_sides_share_the_work_and_keep_its_order(device):
     before = len(wheres)
     closed.close()
     assert len(wheres) <= before + 8
+
+
+def test_hits_on_texels_are_named_as_embrees(device):
+    """Triangles of the traced surface that stand for others of the scene (prt_addon/scene/texel_surface.py)."""
+    points, triangles = ball_field()
+    surface = TracedSurface(points.astype(np.float64), triangles, np.array([0, len(triangles)]),
+                            np.array([100, len(triangles) + 100]), (None,))
+    mixed, alone = MixedTracer(points, triangles, 1, device, surface), Tracer(points, triangles, 1, surface)
+    origins, directions = field_rays(points)
+    asked = np.ones((2, 2000), bool)
+    *_, ours = mixed.nearest_where(alone.to_tracing_space(origins[:2000]), directions[:2], asked)
+    *_, theirs = alone.nearest_where(alone.to_tracing_space(origins[:2000]), directions[:2], asked)
+    assert mixed.gpu_rays == 4000 and ours.traced is not None and theirs.triangle.max() >= 100
+    assert_agree(ours, theirs, 2)
+    assert (ours.traced[0] != theirs.traced[0]).sum() <= 2
 
 
 def test_errors_of_work_come_out(device):
