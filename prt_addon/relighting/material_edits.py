@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import sparse_multiply
+from ..transport.form_factors import row_sums
 from ..transport.interreflection import limited_albedo
 from ..transport.live_operator import LiveOperator
 from ..transport.radiosity import Radiosity, solve_radiosity
 
 Single = NDArray[np.float32]
-# Of the change of light, which itself is a part of the light.
-TOLERANCE = 1e-3
+# Relative, of the change of light, which itself is a part of the light: less than what sampled rows are off by.
+TOLERANCE = 3e-3
 LEAST_SHARE = 0.05  # of a diffuse layer: below, what was baked says too little of the light that arrived
 Solve = Callable[[Single, Single, Single | None], Radiosity]
 
@@ -39,6 +40,7 @@ class MaterialEdits:
     operator: LiveOperator
     on_gpu: Solve | None = None
     _last: Single | None = None
+    _sums: NDArray[np.float64] | None = None
 
     def arriving(self, baked_row: Single) -> Single:
         """The light that arrived I_0 (n, 3), of the baked diffuse row (points, 3) of the baked objects under the
@@ -63,4 +65,7 @@ class MaterialEdits:
         return sparse_multiply(operator.matrix, found.radiosity) * operator.share[:, None], found
 
     def _solve(self, albedo: Single, source: Single, start: Single | None) -> Radiosity:
-        return solve_radiosity(self.operator.matrix, albedo, source, tolerance=TOLERANCE, start=start)
+        if self._sums is None:
+            self._sums = row_sums(self.operator.matrix)
+        return solve_radiosity(self.operator.matrix, albedo, source, tolerance=TOLERANCE, start=start,
+                               sums=self._sums)

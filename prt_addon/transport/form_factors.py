@@ -44,9 +44,11 @@ def row_sums(matrix: sparse.csr_matrix) -> NDArray[np.float64]:
     return np.asarray(matrix.sum(axis=1, dtype=np.float64)).ravel()
 
 
-def radius_bound(matrix: sparse.csr_matrix, albedo: NDArray[np.floating]) -> float:
-    """An upper bound of the spectral radius of rho F: the largest share of light that a receiver sends back."""
-    return float((row_sums(matrix)[:, None] * albedo).max(initial=0.0))
+def radius_bound(matrix: sparse.csr_matrix, albedo: NDArray[np.floating],
+                 sums: NDArray[np.float64] | None = None) -> float:
+    """An upper bound of the spectral radius of rho F: the largest share of light that a receiver sends back. sums: of
+    the rows, where they are known."""
+    return float(((row_sums(matrix) if sums is None else sums)[:, None] * albedo).max(initial=0.0))
 
 
 def spectral_radius(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], steps: int = RADIUS_STEPS) -> float:
@@ -68,12 +70,14 @@ def spectral_radius(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], ste
     return min(estimate, radius_bound(matrix, albedo))
 
 
-def check_exits(matrix: sparse.csr_matrix, albedo: NDArray[np.floating]) -> None:
+def check_exits(matrix: sparse.csr_matrix, albedo: NDArray[np.floating],
+                sums: NDArray[np.float64] | None = None) -> None:
     """Raise BadScene where light is caught for ever: among surfaces that reflect all of it and see nothing else.
 
-    An albedo of 1 is harmless where the light finds a way to the sky or to a darker surface, however far.
+    An albedo of 1 is harmless where the light finds a way to the sky or to a darker surface, however far. sums: of
+    the rows, where they are known.
     """
-    sums = row_sums(matrix)
+    sums = row_sums(matrix) if sums is None else sums
     sent = sums[:, None] * albedo
     if float(sent.max(initial=0.0)) < 1.0 - LEAST_LOSS:
         return
