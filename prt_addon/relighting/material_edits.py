@@ -49,20 +49,27 @@ class MaterialEdits:
         light[:len(baked_row)] = baked_row / np.maximum(self.operator.share[:len(baked_row), None], LEAST_SHARE)
         return light
 
-    def added(self, change: Single, emission: Single, light: Single) -> tuple[Single, Radiosity]:
+    def added(self, change: Single, emission: Single, light: Single, glow: Single | None = None,
+              ) -> tuple[Single, Radiosity]:
         """What F dB adds to the baked diffuse row (n, 3), and how it was found.
 
-        change: (n, 3) of the albedos since the bake; emission: (n, 3), radiance; light: I_0, of `arriving`. Raises
-        BadScene where light would grow without end.
+        change: (n, 3) of the albedos since the bake; emission: (n, 3), radiance; light: I_0, of `arriving`; glow:
+        (points, 3), what arrives of the emission before any bounce where that is known better (`glowing_surfaces`).
+        Raises BadScene where light would grow without end.
         """
         operator = self.operator
         albedo = limited_albedo(np.maximum(operator.albedo + operator.share[:, None] * change, np.float32(0.0)))
+        direct = np.zeros_like(light)
+        if glow is not None:  # dB = e + X with X = (rho - rho_0) I_0 + rho F e + rho F X, where F e is taken from glow
+            direct = sparse_multiply(operator.matrix, emission)
+            direct[:len(glow)] = glow
+            emission = albedo * direct
         source = (albedo - operator.albedo) * light + emission
         start = self._last if self._last is not None and np.isfinite(self._last).all() else None
         solve = self.on_gpu or self._solve
         found = solve(albedo, source, start)
         self._last = found.radiosity
-        return sparse_multiply(operator.matrix, found.radiosity) * operator.share[:, None], found
+        return (direct + sparse_multiply(operator.matrix, found.radiosity)) * operator.share[:, None], found
 
     def _solve(self, albedo: Single, source: Single, start: Single | None) -> Radiosity:
         if self._sums is None:

@@ -14,8 +14,11 @@ from prt_addon.baking.recipe import bake, exhaust
 from prt_addon.baking.settings import make_settings
 from prt_addon.errors import BadScene
 from prt_addon.relighting.exit_radiance import baked_constants, exit_radiance
+from prt_addon.relighting.glowing_surfaces import glow_of
 from prt_addon.relighting.material_edits import TOLERANCE, MaterialEdits
+from prt_addon.relighting.source_irradiance import polygon_irradiance
 from prt_addon.scene.scene_mesh import SceneMesh
+from prt_addon.tracing.tracer import Tracer
 from prt_addon.transport.live_operator import LiveOperator, in_order_of_points, sampled_rows, sampling_error
 from tests.core.shapes import box, join, plane, sphere
 
@@ -93,6 +96,41 @@ def test_a_glowing_surface_lights_the_others_by_their_form_factors(baked):
     near = (distance < 1.2) & (place[:, 0] > 0.7)  # where the block hides nothing of it
     assert near.sum() > 20
     assert rms(added[:floor][near] / expected[near, None] - 1.0) < 0.05
+
+
+def test_traced_glow_is_lamberts_formula_and_casts_shadows():
+    """A square panel over a floor, from both of its sides, and a plate that hides it from half of the floor."""
+    floor, panel = plane("floor", 4.0, cells=24), plane("panel", 0.6, height=1.2, cells=4, up=False)
+    open_scene = Tracer(np.concatenate([floor.positions, panel.positions]), np.concatenate(
+        [floor.triangles, panel.triangles + len(floor.positions)]), 1)
+    normals = np.tile((0.0, 0.0, 1.0), (len(floor.positions), 1))
+    corners = panel.positions[panel.triangles]
+    found = glow_of(open_scene, floor.positions, normals, floor.triangles, corners)
+    square = np.array([(-0.3, -0.3), (0.3, -0.3), (0.3, 0.3), (-0.3, 0.3)])
+    outline = np.concatenate([square, np.full((4, 1), 1.2)], axis=1)[:, None] - floor.positions
+    exact = polygon_irradiance(outline, normals) / np.pi
+    assert np.abs(found - exact).max() < 0.01 * exact.max()
+    turned = glow_of(open_scene, floor.positions, normals, floor.triangles, corners[:, ::-1])
+    assert np.allclose(turned, found, atol=0.01 * exact.max())
+    plate = plane("plate", 2.0, height=0.6, centre=(1.0, 0.0))
+    meshes = (floor, panel, plate)
+    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
+    shaded = Tracer(np.concatenate([mesh.positions for mesh in meshes]), np.concatenate(
+        [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=False)]), 1)
+    found = glow_of(shaded, floor.positions, normals, floor.triangles, corners)
+    x, y = floor.positions[:, 0], np.abs(floor.positions[:, 1])
+    assert not found[(x > 0.4) & (x < 1.6) & (y < 0.6)].any()
+    lit = x < -0.4
+    assert np.abs(found[lit] - exact[lit]).max() < 0.01 * exact.max()
+
+
+def test_a_traced_glow_joins_the_solution():
+    """A furnace whose glow arrives as form factors say gives the same either way."""
+    matrix = sparse.csr_matrix(np.full((40, 40), 1.0 / 40.0, np.float32))
+    edits = MaterialEdits(LiveOperator(matrix, np.full((40, 3), 0.5, np.float32), np.ones(40, np.float32)))
+    ones, nothing = np.ones((40, 3), np.float32), np.zeros((40, 3), np.float32)
+    known, _ = edits.added(0.3 * ones, ones, nothing, ones[:25])
+    assert np.allclose(known, 5.0, rtol=TOLERANCE)
 
 
 def test_furnace_after_an_edit():
