@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..prt_addon.errors import PRTError
-from ..prt_addon.linear_algebra import sparse_multiply
+from ..prt_addon.linear_algebra import sparse_multiply_few
 from ..prt_addon.relighting.material_edits import TOLERANCE
 from ..prt_addon.transport.form_factors import check_exits
 from ..prt_addon.transport.radiosity import JACOBI, MOST_ITERATIONS, Radiosity
@@ -97,9 +97,9 @@ def faster_solver(matrix: sparse.csr_matrix) -> tuple[Callable[..., Radiosity] |
     if bpy.app.background:
         return None, ""
     values = np.ones((matrix.shape[0], 3), np.float32)
-    sparse_multiply(matrix, values)
+    sparse_multiply_few(matrix, values)
     began = time.perf_counter()
-    sparse_multiply(matrix, values)
+    sparse_multiply_few(matrix, values)
     cpu = time.perf_counter() - began
     try:
         solver = RadiosityOnGpu(matrix)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..linear_algebra import sparse_multiply
+from ..linear_algebra import sparse_multiply_few
 from ..transport.form_factors import row_sums
 from ..transport.interreflection import limited_albedo
 from ..transport.live_operator import LiveOperator
@@ -61,7 +61,7 @@ class MaterialEdits:
         albedo = limited_albedo(np.maximum(operator.albedo + operator.share[:, None] * change, np.float32(0.0)))
         direct = np.zeros_like(light)
         if glow is not None:  # dB = e + X with X = (rho - rho_0) I_0 + rho F e + rho F X, where F e is taken from glow
-            direct = sparse_multiply(operator.matrix, emission)
+            direct = sparse_multiply_few(operator.matrix, emission)
             direct[:len(glow)] = glow
             emission = albedo * direct
         source = (albedo - operator.albedo) * light + emission
@@ -69,7 +69,7 @@ class MaterialEdits:
         solve = self.on_gpu or self._solve
         found = solve(albedo, source, start)
         self._last = found.radiosity
-        return (direct + sparse_multiply(operator.matrix, found.radiosity)) * operator.share[:, None], found
+        return (direct + sparse_multiply_few(operator.matrix, found.radiosity)) * operator.share[:, None], found
 
     def _solve(self, albedo: Single, source: Single, start: Single | None) -> Radiosity:
         if self._sums is None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..errors import BadScene
-from ..linear_algebra import sparse_multiply
+from ..linear_algebra import sparse_multiply, sparse_multiply_few
 from ..scene.scene_mesh import SceneMesh
 
 # A receiver loses light where less than 1 - LEAST_LOSS of it comes back: below, single precision can't tell.
@@ -60,7 +60,7 @@ def spectral_radius(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], ste
     values = np.ones(albedo.shape, matrix.dtype)
     rho, estimate = albedo.astype(matrix.dtype), 0.0
     for _ in range(steps):
-        following = rho * sparse_multiply(matrix, values)
+        following = rho * sparse_multiply_few(matrix, values)
         size = np.sqrt(np.sum(np.square(following, dtype=np.float64), axis=0))
         before = np.sqrt(np.sum(np.square(values, dtype=np.float64), axis=0))
         estimate = float((size / np.maximum(before, 1e-300)).max(initial=0.0))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from ..linear_algebra import sparse_multiply
+from ..linear_algebra import sparse_multiply_few
 from .form_factors import check_exits, radius_bound
 from .krylov import SMALLEST, bicgstab_cycle, column_norm, conjugate_gradient_steps
 
@@ -136,10 +136,10 @@ def _jacobi(system: _System, values: NDArray[np.floating]) -> Steps:
     matrix = system.matrix.astype(kind, copy=False)
     albedo = system.albedo.astype(kind)
     inverse = (1.0 / (1.0 - albedo * matrix.diagonal()[:, None])).astype(kind)
-    left = system.emittance + albedo * sparse_multiply(matrix, values) - values
+    left = system.emittance + albedo * sparse_multiply_few(matrix, values) - values
     while True:
         values = values + inverse * left
-        left = system.emittance + albedo * sparse_multiply(matrix, values) - values
+        left = system.emittance + albedo * sparse_multiply_few(matrix, values) - values
         yield values, system.residual_of(left)
 
 
@@ -156,12 +156,12 @@ def _gauss_seidel(system: _System, values: NDArray[np.floating]) -> Steps:
     lower = sparse.tril(system.matrix, 0, format="csc").astype(np.float64)
     factors = [_triangular(lower, albedo[:, part.start or 0]) for part in channels]
     values, emittance = values.astype(np.float64), system.emittance.astype(np.float64)
-    above = albedo * sparse_multiply(upper, values)
+    above = albedo * sparse_multiply_few(upper, values)
     while True:
         right = emittance + above
         for part, factor in zip(channels, factors, strict=True):
             values[:, part] = factor.solve(np.ascontiguousarray(right[:, part]))
-        before, above = above, albedo * sparse_multiply(upper, values)
+        before, above = above, albedo * sparse_multiply_few(upper, values)
         yield values, system.residual_of(above - before)
 
 
@@ -180,7 +180,7 @@ def _bicgstab(system: _System, values: NDArray[np.floating]) -> Steps:
     emittance, solution = system.emittance.astype(kind), values.astype(kind)
 
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return values - albedo * sparse_multiply(matrix, values)
+        return values - albedo * sparse_multiply_few(matrix, values)
 
     for cycle in count():
         residual, history = emittance - apply(solution), []
@@ -206,11 +206,11 @@ def _conjugate_gradients(system: _System, values: NDArray[np.floating]) -> Steps
     into, out = np.sqrt(albedo * area), np.sqrt(albedo / area)
 
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return values - into * sparse_multiply(matrix, out * values)
+        return values - into * sparse_multiply_few(matrix, out * values)
 
     # From a radiosity: sqrt(rho A) H = sqrt(A / rho) (B - E) is undefined for black surfaces, sqrt(rho A) F B is not.
-    solution = into * sparse_multiply(matrix, values.astype(np.float64))
-    residual = into * sparse_multiply(matrix, emittance) - apply(solution)
+    solution = into * sparse_multiply_few(matrix, values.astype(np.float64))
+    residual = into * sparse_multiply_few(matrix, emittance) - apply(solution)
     for left in conjugate_gradient_steps(apply, solution, residual):
         # In radiosity E - M B = rho F B - rho H = sqrt(rho / A) times what is left of y.
         yield emittance + out * solution, system.residual_of(out * left)
