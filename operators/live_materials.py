@@ -25,13 +25,16 @@ from ..prt_addon.relighting.exit_radiance import baked_constants, exit_radiance
 from ..prt_addon.relighting.glowing_surfaces import glow_of
 from ..prt_addon.relighting.material_edits import MaterialEdits
 from ..prt_addon.relighting.moved_light import points_in
+from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import LIVE_ENTRY, BakedTransfer
 from ..prt_addon.tracing.tracer import Tracer
+from ..prt_addon.transport.radiosity import BICGSTAB, GAUSS_SEIDEL, JACOBI
 
 Single = NDArray[np.float32]
 # Where a black surface glows, its glow is drawn as light on an albedo of this size.
 LEAST_ALBEDO = np.float32(1e-4)
+TITLES = {JACOBI: "Jacobi", GAUSS_SEIDEL: "Gauss-Seidel", BICGSTAB: "BiCGSTAB"}
 # Reflected colours and glow nearer than this to those before are the same.
 SAME = 1e-6
 
@@ -193,7 +196,9 @@ class LiveMaterials:
                 if name in surfaces:
                     change[place] = surfaces[name].albedo - shown[name].baked.albedo
                     emission[place] = surfaces[name].emission
+        before_glow = time.perf_counter()
         glow = self._glow(found, shown, surfaces, points, depsgraph)
+        started += time.perf_counter() - before_glow  # traced once: what follows shall not wait as long
         added, solution = found.edits.added(change, emission, found.edits.arriving(baked_row), glow)
         found.versions += 1
         for name, start in found.starts.items():
@@ -201,7 +206,8 @@ class LiveMaterials:
                 mine = added[start:start + len(shown[name].baked.positions)]
                 self._keep(name, shown[name], mine, surfaces.get(name), before.get(name), found.versions)
         self.seconds, self.answers = time.perf_counter() - started, self.answers + 1
-        self.message = (f"Bounced light follows materials: {solution.method}, {solution.iterations} iterations, "
+        self.message = (f"Bounced light follows materials: {TITLES[solution.method]}, "
+                        f"{plural(solution.iterations, 'iteration', 'iterations')}, "
                         f"{self.seconds * 1e3:.0f} ms{self._solver}")
 
     def _glow(self, found: _Set, shown: Mapping[str, Shown], surfaces: dict[str, EditedSurfaces], points: int,
