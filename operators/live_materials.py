@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu_shaders.radiosity import faster_solver
+from ..gpu_shaders.radiosity import measured_solver
 from ..prt_addon.blender.live_materials import EditedSurfaces, edited_surfaces, read_live, slots_of_receivers
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import baked_mesh
@@ -92,7 +92,6 @@ class LiveMaterials:
     seconds: float = 0.0
     answers: int = 0
     _sets: dict[str, _Set] = field(default_factory=dict)
-    _solver: str = ""
     _tracer: tuple[bytes, Tracer] | None = None  # of everything, with the move of the set that it was made for
 
     def read(self, shown: Mapping[str, Shown], owners: Mapping[str, bpy.types.Object]) -> None:
@@ -121,8 +120,7 @@ class LiveMaterials:
                 self.message = str(error)
                 return None
             if live is not None:
-                on_gpu, self._solver = faster_solver(live.matrix)
-                return MaterialEdits(live, on_gpu)
+                return MaterialEdits(live, *measured_solver(live.matrix))
         self.message = "Bounced light does not follow materials: the object that carries what it needs is not shown"
         return None
 
@@ -208,7 +206,7 @@ class LiveMaterials:
         self.seconds, self.answers = time.perf_counter() - started, self.answers + 1
         self.message = (f"Bounced light follows materials: {TITLES[solution.method]}, "
                         f"{plural(solution.iterations, 'iteration', 'iterations')}, "
-                        f"{self.seconds * 1e3:.0f} ms{self._solver}")
+                        f"{self.seconds * 1e3:.0f} ms{_where(found.edits)}")
 
     def _glow(self, found: _Set, shown: Mapping[str, Shown], surfaces: dict[str, EditedSurfaces], points: int,
               depsgraph: bpy.types.Depsgraph) -> Single | None:
@@ -263,6 +261,16 @@ class LiveMaterials:
             self.edited[name] = Edited(item.baked, item.key, values)
             return
         self.edited[name] = Edited(replace(item.baked, albedo=albedo), (item.key, "edited", version), values)
+
+
+def _where(edits: MaterialEdits) -> str:
+    """Who solved, and why, as a clause."""
+    if edits.on_gpu is None:
+        return ""
+    if edits.used_gpu:
+        return " on the GPU"
+    slower = f", {edits.gpu_cost:.1f} times as fast as the GPU here" if edits.gpu_cost > 1.0 else ""
+    return f" on the CPU{slower}"
 
 
 def _same(one: EditedSurfaces, other: EditedSurfaces) -> bool:

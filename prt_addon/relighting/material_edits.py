@@ -20,10 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..linear_algebra import sparse_multiply_few
-from ..transport.form_factors import row_sums
+from ..transport.form_factors import radius_bound, row_sums
 from ..transport.interreflection import limited_albedo
 from ..transport.live_operator import LiveOperator
-from ..transport.radiosity import Radiosity, solve_radiosity
+from ..transport.radiosity import (
+    JACOBI,
+    Radiosity,
+    choose_solver,
+    predicted_cost,
+    predicted_iterations,
+    solve_radiosity,
+)
 
 Single = NDArray[np.float32]
 # Relative, of the change of light, which itself is a part of the light: less than what sampled rows are off by.
@@ -35,10 +42,13 @@ Solve = Callable[[Single, Single, Single | None], Radiosity]
 @dataclass
 class MaterialEdits:
     """Answers to edits of the materials of one bake, each started from the last. operator: of the bake; on_gpu: solves
-    (albedo, emittance, start) elsewhere, None to solve here."""
+    (albedo, emittance, start) by Jacobi elsewhere, None to solve here always; gpu_cost: of an iteration there, in
+    sparse products here; used_gpu: by the last answer."""
 
     operator: LiveOperator
     on_gpu: Solve | None = None
+    gpu_cost: float = np.inf
+    used_gpu: bool = False
     _last: Single | None = None
     _sums: NDArray[np.float64] | None = None
 
@@ -66,13 +76,18 @@ class MaterialEdits:
             emission = albedo * direct
         source = (albedo - operator.albedo) * light + emission
         start = self._last if self._last is not None and np.isfinite(self._last).all() else None
-        solve = self.on_gpu or self._solve
-        found = solve(albedo, source, start)
+        found = self._solve(albedo, source, start)
         self._last = found.radiosity
         return (direct + sparse_multiply_few(operator.matrix, found.radiosity)) * operator.share[:, None], found
 
     def _solve(self, albedo: Single, source: Single, start: Single | None) -> Radiosity:
         if self._sums is None:
             self._sums = row_sums(self.operator.matrix)
+        bound = radius_bound(self.operator.matrix, albedo, self._sums)
+        here = predicted_cost(choose_solver(bound, TOLERANCE), bound, TOLERANCE)
+        self.used_gpu = self.on_gpu is not None and \
+            self.gpu_cost * predicted_iterations(JACOBI, bound, TOLERANCE) < here
+        if self.used_gpu:
+            return self.on_gpu(albedo, source, start)
         return solve_radiosity(self.operator.matrix, albedo, source, tolerance=TOLERANCE, start=start,
                                sums=self._sums)

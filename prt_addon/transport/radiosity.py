@@ -100,9 +100,13 @@ def choose_solver(radius: float, tolerance: float, costs: Mapping[str, float] = 
                   preparation: Mapping[str, float] = PREPARATION) -> str:
     """The method that is predicted to be done first. costs: of an iteration of each method at hand, preparation: before
     the first, in any common unit; those of `RELATIVE_COSTS` where nothing was measured."""
-    def total(method: str) -> float:
-        return costs[method] * predicted_iterations(method, radius, tolerance) + preparation.get(method, 0.0)
-    return min(costs, key=total)
+    return min(costs, key=lambda method: predicted_cost(method, radius, tolerance, costs, preparation))
+
+
+def predicted_cost(method: str, radius: float, tolerance: float, costs: Mapping[str, float] = RELATIVE_COSTS,
+                   preparation: Mapping[str, float] = PREPARATION) -> float:
+    """What a solution will cost, in the unit of the costs."""
+    return costs[method] * predicted_iterations(method, radius, tolerance) + preparation.get(method, 0.0)
 
 
 @dataclass(frozen=True)
