@@ -296,8 +296,8 @@ class PRTSettings(bpy.types.PropertyGroup):
     live_editing: BoolProperty(
         name="Live Materials", default=PRESETS["standard"].live_editing,
         description="Bounced light in the preview follows base colours and emission that you change later, without a "
-                    "new bake. Costs 0.8 MB of data for 1,000 receivers at 96 Entries, hardly any time, and a separate "
-                    "mesh for objects of several materials",
+                    "new bake. Costs half a MB of data for 1,000 receivers at 64 Entries, hardly any time, and a "
+                    "separate mesh for objects of several materials",
     )
     live_entries: IntProperty(
         name="Entries", min=8, max=1024, soft_max=256, default=PRESETS["standard"].live_entries,
