@@ -70,6 +70,13 @@ DISTANT_BASIS_ITEMS = (
     ("auto", "Automatic", "Harmonics or a cubemap, as large as the present light needs for the asked error. Costs a "
                           "second; a sharper light that comes later is shown blurred. Analyze tells what and why", 2),
 )
+SAMPLING_ITEMS = (
+    ("automatic", "Automatic", "All texels, unless fewer are surely faster and exact enough. The report says why", 0),
+    ("every", "Every Element", "Rays for all texels at all receivers. No error, and mostly the fastest", 1),
+    ("sparse", "Sparse", "Rays for about an eighth of them; the rest is woven from neighbours. Up to twice as fast "
+                         "for detailed meshes, slower for simple ones. Adds about 1 % of error; the report states it",
+     2),
+)
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
     ("collection", "Collection", "The meshes of a collection, whatever is selected", 1),
@@ -81,7 +88,7 @@ QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing"
            "surface_columns", "cloud_lights", "merge_response")
 # What goes into a bake under its own name.
 OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "subsurface_links", "coherence", "lamp_basis", "cloud_spacing",
-             "cloud_emission", "distant_basis", "cubemap_size", "memory_budget",
+             "cloud_emission", "distant_basis", "cubemap_size", "sampling", "memory_budget",
              "zone_receivers", "fit_order_to_light", "live_editing", "live_entries", "threads", "seed")
 ROUNDING = 1e-6  # of single precision
 
@@ -147,6 +154,10 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Along each edge of the cubemap. Twice as many show shadows twice as sharp; time, memory and disk "
                     "grow with the square",
     )
+    sampling: EnumProperty(
+        name="Shadow Samples", items=SAMPLING_ITEMS, default=PRESETS["standard"].sampling,
+        description="Of a cubemap's texels, which get rays from which receivers",
+    )
     memory_budget: FloatProperty(
         name="Memory", min=0.0, soft_max=64.0, precision=1, default=PRESETS["standard"].memory_budget,
         description="Gigabytes of transfer kept in memory while a cubemap is baked; more goes to a file, which costs "
@@ -172,10 +183,10 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "the surfaces that lamps shine on. Costs some drawing while on, nothing while off",
     )
     lamps_by_directions: BoolProperty(
-        name="Lamps by Nearest Directions", update=_light_changed, default=False,
-        description="Point, Spot and Area lamps light bakes made without local lights, as light from where they are. "
-                    "Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, at 1.5 "
-                    "radii 14 % off beside a ground. Costs some milliseconds a lamp",
+        name="Lamps from Afar", update=_light_changed, default=False,
+        description="Point, Spot and Area lamps light bakes made without local lights, by the directions nearest to "
+                    "them. Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, "
+                    "at 1.5 radii 14 % off beside a ground. Costs some milliseconds a lamp",
     )
     window: BoolProperty(
         name="Soften Ringing", update=_light_changed, default=False,
@@ -267,8 +278,8 @@ class PRTSettings(bpy.types.PropertyGroup):
     )
     glossy_window: BoolProperty(
         name="Soften Sharp Ones", default=PRESETS["standard"].glossy_window,
-        description="Highlights sharper than the order of the light reflect a softer light. Buys highlights without "
-                    "dark rings, costs some of their sharpness and no time",
+        description="Highlights sharper than the light's order, or with a cubemap than their functions, reflect a "
+                    "softer light. Buys highlights without dark rings, costs some of their sharpness and no time",
     )
     subsurface: BoolProperty(
         name="Translucency", default=PRESETS["standard"].subsurface,

@@ -40,6 +40,7 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         distant = column.column()
         distant.active = settings.lighting != "local"
         if settings.distant_basis != "sh":
+            distant.prop(settings, "sampling")
             distant.prop(settings, "memory_budget")
         if settings.distant_basis == "sh":
             distant.prop(settings, "fit_order_to_light")
@@ -60,9 +61,7 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
         shiny.prop(settings, "glossy_albedo")
-        window = shiny.column()
-        window.active = settings.distant_basis == "sh"  # texels do not ring
-        window.prop(settings, "glossy_window")
+        shiny.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
         lamps = column.column()
         lamps.active = settings.lighting != "environment"

@@ -17,8 +17,9 @@ from ..transport.live_operator import BYTES_PER_ENTRY
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .distant_basis import array_budget, distant_basis
+from .sampling import dense_bytes, forecast_seconds, forecast_share, sampling_hints
 from .settings import EIGENTRANSPORT, BakeSettings
-from .sparse_choice import note_sparse, sparse_left_out
+from .sparse_choice import TYPICAL_SECONDS, note_sparse, sparse_left_out
 from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
@@ -91,17 +92,20 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
                    settings.fit_order_to_light, surfaces.coloured)
     needs.left_out += surfaces.left_out
     needs.hints += surfaces.hints
+    needs.hints += sampling_hints(settings)
     columns = distant_basis(settings, needs.order).columns
-    if basis.cubemap and needs.shadow_rays:
-        note_sparse(needs, sparse_left_out(receivers, columns))
+    if basis.cubemap and needs.shadow_rays and settings.sampling == "automatic":
+        rays_each = basis.samples(settings.directions) ** 2
+        note_sparse(needs, sparse_left_out(receivers, columns, TYPICAL_SECONDS * rays_each))
     values = receivers * columns * needs.channels
     glossy, translucent = int(surfaces.glossy_points(scene).sum()), int(surfaces.translucent_points(scene).sum())
     seconds, rays = {"prepare": 0.2 + 1e-6 * len(scene.triangles)}, {}
     if needs.bounces:
         rays["gather"] = gather
         seconds["gather"] = gather / GATHER_RAYS_PER_SECOND
-    rays["direct"] = shadow if needs.shadow_rays else 0
+    rays["direct"] = int(shadow * forecast_share(settings, glossy > 0)) if needs.shadow_rays else 0
     seconds["direct"] = rays["direct"] / SHADOW_RAYS_PER_SECOND + 1e-8 * values
+    seconds["direct"] += forecast_seconds(settings, receivers, columns, glossy > 0)
     if needs.bounces:
         seconds["interreflection"] = values * settings.gather_directions * 0.02 * SECONDS_PER_BOUNCED_VALUE + 0.05
     if glossy and settings.distant_light:
@@ -204,7 +208,8 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
         rows = on_disk = 0
     local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions), share)
     shapes = _shapes(scene, settings, needs, surfaces, share)
-    stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
+    stages = [known + transfer + dense_bytes(settings, receivers, basis.columns),
+              known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
               known + second + copies * solved,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
               known + transfer + rows + local.kept + max(local.zone, second + local.solving),

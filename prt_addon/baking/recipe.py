@@ -73,8 +73,9 @@ from .results import (
     surface_checks,
     white_world_checks,
 )
+from .sampling import SampledDirect, can_start_dense, dense_points, encode_from_dense, sampling_checks
 from .settings import EIGENTRANSPORT, BakeSettings
-from .sparse_choice import measured_sparse, note_sparse
+from .sparse_choice import note_sparse
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .texel_highlights import (
     columns_through_bodies,
@@ -161,6 +162,8 @@ class _Bake:
     coherence: dict[str, Coherence] = field(default_factory=dict)
     point_errors: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    dense: NDArray[np.bool_] | None = None
+    sampling: dict[str, Any] = field(default_factory=dict)
     buried: NDArray[np.int64] | None = None
     local: LocalTransfer | None = None
     local_scale: float = 1.0
@@ -342,6 +345,8 @@ class _Bake:
         stored = self._load("direct")
         if stored is not None:
             found = stored[0]
+            if self.basis.cubemap:
+                self._sampled(receivers, SampledDirect.unpacked(*stored))
             visibility = VisibilityCoefficients(found["rows"], found["visible"], found.get("blocked")) \
                 if "rows" in found else None
             return receivers, found["transfer"], visibility
@@ -350,11 +355,11 @@ class _Bake:
         chosen = front & self.glossy[receivers.key % len(self.scene.points)]
         if self.basis.cubemap:
             plain = texel_visibility(chosen, self.basis, self.settings, gathered is not None)
-            transfer = yield from self._follow("direct", direct_cubemap(
-                self.tracer, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.folder, plain))
-            if self.plan.needs.shadow_rays:
-                note_sparse(self.plan.needs, measured_sparse(self.tracer, receivers, self.basis, self.settings.seed))
-            return receivers, transfer, self._visibility(receivers, transfer, plain)
+            sampled = yield from self._follow("direct", direct_cubemap(
+                self.tracer, self.scene, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.light,
+                self.folder, plain))
+            transfer = self._sampled(receivers, sampled)
+            return receivers, transfer, self._visibility(receivers, transfer, plain, *sampled.kept())
         if chosen.any():
             plain = HemisphereVisibility(chosen, INCIDENT_ORDER + order - 1, INCIDENT_ORDER if gathered else 0)
         transfer = yield from self._follow("direct", direct_transfer(
@@ -363,13 +368,20 @@ class _Bake:
         return receivers, transfer, self._visibility(receivers, transfer, plain)
 
     def _visibility(self, receivers: ReceiverSet, transfer: NDArray[np.float32],
-                    plain: HemisphereVisibility | TexelVisibility | None) -> VisibilityCoefficients | None:
+                    plain: HemisphereVisibility | TexelVisibility | None, arrays: dict[str, NDArray] | None = None,
+                    header: dict[str, Any] | None = None) -> VisibilityCoefficients | None:
         """What was collected for highlights, once the stage is kept."""
         visibility = plain.result(receivers.normals) if plain else None
         extra = {name: value for name, value in vars(visibility).items() if value is not None} if visibility else {}
         if is_kept(transfer, self.settings) or not self.basis.cubemap:
-            self._save("direct", {"transfer": transfer, **extra})
+            self._save("direct", {"transfer": transfer, **extra, **(arrays or {})}, header)
         return visibility
+
+    def _sampled(self, receivers: ReceiverSet, found: SampledDirect) -> NDArray[np.float32]:
+        """Keep what the report tells of how direct light was sampled, and which points the encoder starts from."""
+        self.dense, self.sampling = dense_points(self.scene, receivers, found.dense), found.facts
+        note_sparse(self.plan.needs, found.left_out)
+        return found.transfer
 
     def _glossy(self, receivers: ReceiverSet, transfer: NDArray[np.float32], visibility: VisibilityCoefficients,
                 gathered: Gather | None) -> Generator[Progress, None, GlossyRows]:
@@ -674,6 +686,10 @@ class _Bake:
         if self.local is None and self.settings.encoder == EIGENTRANSPORT and metric is None:
             encoding = eigentransport(signal, settings.vectors, target_error=settings.target_error,
                                       seed=settings.seed, progress=state.report).encoding
+        elif self.local is None and self.dense is not None and metric is None and can_start_dense(
+                dense := self.dense[target.points][~self.scene.loose[target.points]], settings.method):
+            positions = self.scene.points[target.points][~self.scene.loose[target.points]]
+            encoding = encode_from_dense(signal, dense, positions, settings, state.report)
         elif self.local is None:
             encoding = encode(signal, settings, metric, state.report)
         else:
@@ -790,7 +806,7 @@ class _Bake:
                 bodies: list[BodyLight]) -> BakeResult:
         """errors: the budget of diffuse light and that of highlights."""
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings, self.basis)
-        stability += surface_checks(self.surfaces, bodies)
+        stability += surface_checks(self.surfaces, bodies) + sampling_checks(self.sampling)
         if self.settings.distant_light:
             stability += white_world_checks(self._white_worlds(encodings))
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
@@ -809,6 +825,7 @@ class _Bake:
             if self.local_errors:
                 report["covers"] += lamps_covered(self.local_highlight_errors)
             report["scene"]["warnings"] += self.local.facts["warnings"]
+        report["sampling"] = self.sampling
         if self.memory_warning:
             report["scene"]["warnings"].append(f"Bake: {self.memory_warning}")
         if self.filled:

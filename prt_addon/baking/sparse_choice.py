@@ -9,16 +9,11 @@ from __future__ import annotations
 
 from ..reporting.wording import duration
 from ..scene.needs import LeftOut, Needs
-from ..tracing.tracer import Tracer
-from ..transport.elements import VisibilityElements
-from ..transport.receiver_set import ReceiverSet
-from ..transport.sparse_plan import element_seconds, plan
-from .distant_basis import DistantBasis
+from ..transport.sparse_plan import HARDER_RAYS, SparsePlan, plan
 
-SPARSE = "sparse sampling of the cubemap's texels"
-# Seconds of a ray in the order in which sparse sampling asks for it, on two cores: 0.175 to 0.232 us were measured.
-TYPICAL_SECONDS = 2e-7
-RUNS = 3
+SPARSE, SAVED = "sparse sampling of the cubemap's texels", "the error of interpolation"
+# Seconds of a ray in order, on two cores: 0.04 to 0.15 us were measured. An element is a few of them.
+TYPICAL_SECONDS = 1e-7
 
 
 def sparse_left_out(receivers: int, columns: int, seconds: float = TYPICAL_SECONDS) -> LeftOut:
@@ -27,17 +22,14 @@ def sparse_left_out(receivers: int, columns: int, seconds: float = TYPICAL_SECON
     Even where rays are so slow that it would be faster it is done only where it is asked for: it gains a part of one
     stage, and costs its error.
     """
-    found = plan(receivers, columns, seconds)
-    asked = "it is done only where it is asked for: " if found.pays else ""
+    return sparse_line(plan(receivers, columns, seconds, harder=HARDER_RAYS), "it is done only where it is asked for")
+
+
+def sparse_line(found: SparsePlan, against: str) -> LeftOut:
+    """The line for a plan; against: what speaks against sparse sampling where it would be faster."""
+    asked = f"{against}: " if found.sparse_seconds < found.all_seconds else ""
     return LeftOut(SPARSE, f"{asked}tracing all of them takes about {duration(found.all_seconds)}, tracing some and "
-                   f"interpolating the others {duration(found.sparse_seconds)}", "the error of interpolation")
-
-
-def measured_sparse(tracer: Tracer, receivers: ReceiverSet, basis: DistantBasis, seed: int) -> LeftOut:
-    """The same by the measured cost of an element, the least of some times some thousand rays: machines are shared."""
-    elements = VisibilityElements(tracer, receivers, basis.cubemap)
-    seconds = min(element_seconds(elements, seed + run) for run in range(RUNS))
-    return sparse_left_out(len(receivers), basis.columns, seconds)
+                   f"interpolating the others {duration(found.sparse_seconds)}", SAVED)
 
 
 def note_sparse(needs: Needs, found: LeftOut | None) -> None:

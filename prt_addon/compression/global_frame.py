@@ -218,7 +218,7 @@ def _axes_of_some(wide: _Wide) -> NDArray[np.float32]:
     """Orthonormal axes (n, k): the principal ones of points evenly spread over the signal, from their products with
     each other, which are few where values are very many."""
     points, values = wide.signal.shape
-    count = min(points, max(FEWEST_AXES, MOST_SAMPLED // values))
+    count = min(points, max(FEWEST_AXES, min(MOST_SAMPLED // values, MOST_WIDTH + MOST_WIDTH // 2)))
     places = np.unique(np.linspace(0, points - 1, count).astype(np.int64))
     rows = wide.within(_centred(wide.signal[places], wide.mean, wide.scale), wide.root)
     products = np.zeros((len(places),) * 2)

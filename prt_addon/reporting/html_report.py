@@ -26,8 +26,8 @@ MOST_CURVES = len(svg_plots.SERIES_CLASSES)
 def render(report: Report) -> str:
     """The page of a valid report (see `report_file.problem_of`)."""
     style = Path(__file__).with_name("report.css").read_text("utf-8")
-    sections = (_attention, _times, _errors, _left_out, _basis, _cloud, _compression, _bounces, _checks, _settings,
-                _glossary)
+    sections = (_attention, _times, _errors, _sampling, _left_out, _basis, _cloud, _compression, _bounces, _checks,
+                _settings, _glossary)
     body = "\n".join(section(report) for section in sections)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -171,6 +171,18 @@ def _errors_of_objects(report: Report) -> str:
     rows = [[escape(name), *(percent(errors[name]) if name in errors else "" for errors in found.values())]
             for name in names]
     return "<h3>Object by object</h3>" + _table((("Object", False), *((part, True) for part in found)), rows)
+
+
+def _sampling(report: Report) -> str:
+    """Which part of a cubemap's direct light was traced; nothing where all of it was."""
+    facts = report.get("sampling")
+    if not facts:
+        return ""
+    text = (f"Shadows of {percent(facts['traced'])} of all pairs of a point and a texel were traced, and those of the "
+            f"others woven from points near by; {percent(facts['dense'])} of the points were looked at closely. At "
+            f"{plural(facts['checked'], 'random point', 'random points')} all of them were traced: single ones are off "
+            f"by {percent(facts['element_error'])}, the light by {percent(facts['light_error'])}.")
+    return _section("Sparse sampling", f"<p>{escape(text)}</p>")
 
 
 def _left_out(report: Report) -> str:

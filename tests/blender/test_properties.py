@@ -69,7 +69,8 @@ def test_a_chosen_preset_changes_nothing_of_itself(settings: bpy.types.PropertyG
     ("error_receivers", 7, "error_receivers", 7), ("error_paths", 100, "error_paths", 100),
     ("surface_patches", 77, "surface_patches", 77), ("cloud_emission", 3, "cloud_emission", 3),
     ("lamp_basis", "cloud", "lamp_basis", "cloud"), ("distant_basis", "cubemap", "distant_basis", "cubemap"),
-    ("cubemap_size", 8, "cubemap_size", 8), ("memory_budget", 0.5, "memory_budget", 0.5),
+    ("cubemap_size", 8, "cubemap_size", 8), ("sampling", "sparse", "sampling", "sparse"),
+    ("memory_budget", 0.5, "memory_budget", 0.5),
     ("encoder", "eigentransport", "encoder", "eigentransport")])
 @pytest.mark.parametrize("preset", ["draft", "standard", "high"])
 def test_each_control_changes_its_setting_and_no_other(preset: str, name: str, value: object, field: str,
