@@ -182,7 +182,7 @@ class LiveMaterials:
         if not any(one.changed for one in surfaces.values()):
             for name in found.starts:
                 self.edited.pop(name, None)
-            self.message = ""
+            self.message, self.answers = "", self.answers + 1
             return
         points = max(start + len(shown[name].baked.positions) for name, start in found.starts.items() if name in shown)
         baked_row = np.zeros((points, 3), np.float32)
