@@ -36,6 +36,9 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         bounced.active = settings.bounces
         bounced.prop(settings, "gather_directions")
         bounced.prop(settings, "bounce_error")
+        column.prop(settings, "receivers")
+        if settings.receivers != "vertices":
+            column.prop(settings, "atlas_size")
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
