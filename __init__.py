@@ -24,6 +24,7 @@ from .operators.export import PRT_OT_export
 from .operators.interrupted import PRT_OT_discard_interrupted, PRT_OT_resume
 from .operators.job_mixin import JobMixin
 from .operators.keyframe_light import PRT_OT_keyframe_light
+from .operators.measure_tracing import PRT_OT_measure_tracing
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
 from .operators.report import PRT_OT_show_report, PRT_OT_write_report
@@ -31,6 +32,7 @@ from .panels.bake import PRT_PT_bake
 from .panels.check import PRT_PT_check
 from .panels.lamp import PRT_PT_lamp
 from .panels.light_presets import PRT_PT_light_animation, PRT_PT_light_presets, PRT_PT_lights
+from .panels.live_materials import PRT_PT_live_materials
 from .panels.preview import PRT_PT_preview
 from .panels.properties_editor import PRT_PT_object, PRT_PT_world
 from .panels.results import PRT_PT_last_bake, PRT_PT_results
@@ -55,6 +57,7 @@ CLASSES = (
     PRT_OT_keyframe_light,
     PRT_OT_draw_camera,
     PRT_OT_compare,
+    PRT_OT_measure_tracing,
     PRT_OT_export,
     PRT_OT_write_report,
     PRT_OT_show_report,
@@ -63,6 +66,7 @@ CLASSES = (
     PRT_PT_highlights,
     PRT_PT_local_lights,
     PRT_PT_compression,
+    PRT_PT_live_materials,
     PRT_PT_preview,
     PRT_PT_light_presets,
     PRT_PT_lights,

@@ -13,6 +13,7 @@ Reading order is data order:
                      when the data's signature changes, relit when the light's changes, else only drawn.
     overlay.py       marks over the picture: points, lines, triangles, and the legend of false colours
     occluders.py     depth of surfaces that are not ours, where Blender leaves none.
+    ray_programs.py, ray_device.py, tracing_worker.py   rays on the GPU, in a child process (docs/ray_engine.md)
     viewport.py      the draw handlers: `enable(get_draw_list)`, `disable()`, `status()`.
     offscreen.py     `draw_camera` for background mode and the bpy wheel, `write_png`.
 

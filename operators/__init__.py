@@ -17,6 +17,7 @@
     live_preview.py    what the viewport draws, and the handlers that make it follow the scene and its light
     commands.py        the command line: `main(arguments) -> int`; verbs.py: what each verb does
     compare.py         prt.compare, around compare_session.py: the preview beside Cycles, in the same queue as bakes
+    tracing_choice.py  who traces a bake; measure_tracing.py: prt.measure_tracing, in the same queue as bakes
     export.py          prt.export      report.py    prt.write_report, prt.show_report
     draw_camera.py     prt.draw_camera arguments.py what commands and operators take alike, as text
 """

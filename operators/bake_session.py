@@ -8,7 +8,6 @@ is complete. Whatever ends a bake earlier leaves previous bakes as they are and 
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -20,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
+from ..prt_addon.baking.basis_choice import choose_basis
 from ..prt_addon.baking.claims import Claim, discard_if_free
+from ..prt_addon.baking.distant_basis import distant_basis
 from ..prt_addon.baking.local_lights import fit_to_lamps
 from ..prt_addon.baking.memory import memory_warning
 from ..prt_addon.baking.plan import make_plan
@@ -43,6 +44,7 @@ from ..prt_addon.reporting.headline import PARTS, headline
 from ..prt_addon.reporting.wording import plural
 from ..prt_addon.scene.scene_mesh import SceneMesh
 from .place import Place
+from .tracing_choice import bake_process, left_out, tracing_choice
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 KEPT_DAYS = 14
@@ -82,7 +84,8 @@ def read_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings, targets: 
     lamps = np.array([lamp.position for lamp in read_local_lights(depsgraph, [])]).reshape(-1, 3)
     centres = light_regions(depsgraph, settings.cloud_region)[:, :3, 3] if settings.local_light else np.empty((0, 3))
     mesh = SceneMesh.assemble(read_objects(depsgraph, targets, warnings, selected), settings.spacing,
-                              np.concatenate([lamps, centres]) if settings.local_light else None, settings.texels)
+                              np.concatenate([lamps, centres]) if settings.local_light else None,
+                              settings.texels, settings.live_editing)
     return replace(mesh, warnings=(*warnings, *mesh.warnings))
 
 
@@ -90,8 +93,13 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
                   targets: Sequence[str] | None) -> dict[str, Any]:
     """What a bake of the scene would need, leave out and cost, as JSON-able values."""
     scene = read_scene(depsgraph, settings, targets)
-    settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
-    plan = make_plan(scene, transport_settings(settings), reference_light(depsgraph))
+    settings, lost = fit_to_lamps(settings, read_local_lights(depsgraph, []))
+    light = reference_light(depsgraph)
+    # In Blender's own process nothing starts threads (design/architecture.md).
+    settings, choice = choose_basis(scene, settings, light, threads=1)
+    settings = transport_settings(settings)
+    plan = make_plan(scene, settings, light)
+    basis = distant_basis(settings, plan.needs.order) if settings.distant_light else None
     try:
         too_much = memory_warning(plan, settings)
     except BadScene as error:  # an analysis tells it and goes on
@@ -102,10 +110,13 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
         "receivers": plan.receivers,
         "triangles": len(scene.triangles),
         "needs": {"shadow_rays": plan.needs.shadow_rays, "bounces": plan.needs.bounces,
-                  "channels": plan.needs.channels, "order": plan.needs.order},
-        "left_out": [asdict(item) for item in plan.needs.left_out],
+                  "channels": plan.needs.channels, **(basis.facts if basis else {})},
+        "basis": basis.words if basis else "",
+        "choice": None if choice is None else choice.facts,
+        "left_out": [*(asdict(item) for item in plan.needs.left_out), *left_out(settings.threads)],
+        "tracer": tracing_choice(settings.threads).why,
         "hints": list(plan.needs.hints),
-        "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *left_out],
+        "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *lost],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
         "rays": sum(plan.rays.values()),
@@ -123,7 +134,8 @@ def analysis_lines(analysis: dict[str, Any]) -> list[str]:
     lines += [f"Left out: {item['what']}, because {item['why']}" for item in analysis["left_out"]]
     told = [line for line in analysis["warnings"] if line.startswith("Bake: ")]  # of memory: first, as it may end it
     rest = [line for line in analysis["warnings"] if line not in told]
-    return lines[:1] + told + lines[1:] + analysis["hints"] + rest
+    basis = [analysis["choice"]["line"]] if analysis["choice"] else [analysis["basis"]] * bool(analysis["basis"])
+    return lines[:1] + told + basis + lines[1:] + analysis["hints"] + rest
 
 
 @dataclass
@@ -156,12 +168,13 @@ class BakeSession:
         if selected is None:
             selected = selected_names(depsgraph.view_layer)
         scene = read_scene(depsgraph, settings, targets, selected)
-        settings, left_out = fit_to_lamps(settings, read_local_lights(depsgraph, []))
-        scene = replace(scene, warnings=(*scene.warnings, *left_out))
+        settings, lost = fit_to_lamps(settings, read_local_lights(depsgraph, []))
+        scene = replace(scene, warnings=(*scene.warnings, *lost))
         names = [o.name for o in scene.objects if o.is_target]
         targets_found = find_objects(names, depsgraph.scene)
         _check_storable(targets_found)
-        digests = {name: fingerprint(found, depsgraph) for name, found in zip(names, targets_found, strict=True)}
+        digests = {name: fingerprint(found, depsgraph, settings.live_editing)
+                   for name, found in zip(names, targets_found, strict=True)}
         geometry = {name: digest["geometry"] or "" for name, digest in digests.items()}
         folder = jobs_folder()
         _drop_forgotten(folder)
@@ -172,7 +185,7 @@ class BakeSession:
             write_record(claim.folder, JobRecord(
                 bpy.data.filepath, place.scene, place.view_layer, tuple(names), _tuple(targets), tuple(selected),
                 asked.as_dict(), digests, around, os.getpid(), time.time()))
-            process = BakeProcess([sys.executable, *bpy.app.python_args], claim.folder)
+            process = bake_process(claim, settings.threads)
             process.start()
         except BaseException:
             claim.release()
@@ -184,7 +197,7 @@ class BakeSession:
         """An interrupted bake whose result is there, if the scene is as it was when it was read; else None."""
         found = {o.name_full: o for o in depsgraph.scene.objects}
         if not jobs.job_summary(folder)["complete"] or surroundings(depsgraph) != record.surroundings or any(
-                name not in found or fingerprint(found[name], depsgraph) != digest
+                name not in found or fingerprint(found[name], depsgraph, "live_materials" in digest) != digest
                 for name, digest in record.digests.items()):
             return None
         claim = Claim.take(folder)
@@ -212,6 +225,7 @@ class BakeSession:
         is lost if the file can't be saved.
         """
         result = jobs.read_result(self.job)
+        result.report["left_out"] += left_out(int(result.report["settings"]["threads"]))
         found = self.targets()
         gone = [name for name, target in found.items() if target is None]
         if len(gone) == len(found):

@@ -130,6 +130,12 @@ def _add_light_options(parser: argparse.ArgumentParser) -> None:
                         help="take ringing out of the light, where it rings, at the price of some of its detail")
 
 
+def _add_by_directions(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--lamps-by-directions", action="store_true",
+                        help="the scene's lamps light bakes without local light, too, as light from their direction; "
+                             "only lamps outside the hull of the scene")
+
+
 def _add_analyze(group: argparse._SubParsersAction) -> None:
     _add_scene_options(_verb(group, "analyze", "Print what the scene needs, what is left out, and the expected cost."))
 
@@ -148,6 +154,7 @@ def _add_relight(group: argparse._SubParsersAction) -> None:
     _add_light_options(parser)
     parser.add_argument("--use-scene-lights", action="store_true",
                         help="add the scene's Suns to the environment, and its lamps where a light cloud was baked")
+    _add_by_directions(parser)
 
 
 def _add_preview(group: argparse._SubParsersAction) -> None:
@@ -156,6 +163,7 @@ def _add_preview(group: argparse._SubParsersAction) -> None:
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.png")
     parser.add_argument("--size", type=size_of, default=None, metavar="WxH", help="default: the scene's resolution")
     _add_light_options(parser)
+    _add_by_directions(parser)
 
 
 def _add_report(group: argparse._SubParsersAction) -> None:

@@ -103,7 +103,7 @@ class CompareSession:
             raise BadArguments("samples", f"{samples} can't be halved or is too much", f"Give 2 to {MOST_SAMPLES}")
         parts, samples = parts_of(samples)
         baked = read_all(scene, scene.name)
-        lit = relit(scene, baked, window=_window(scene))
+        lit = relit(scene, baked, window=_window(scene), by_directions=_setting(scene, "lamps_by_directions"))
         draw_lit(scene, baked, lit, 8, 8)  # compiles the shaders, which is no part of a picture's time
         started = time.perf_counter()
         draw_lit(scene, baked, lit, *size)
@@ -176,8 +176,13 @@ def displayed(scene: bpy.types.Scene, colours: NDArray[np.floating], alpha: NDAr
 
 
 def _window(scene: bpy.types.Scene) -> bool:
-    """Whether the preview of this scene takes ringing out; a command has no panel to say so."""
-    return bool(getattr(getattr(scene, "prt", None), "window", False))
+    """Whether the preview of this scene takes ringing out."""
+    return _setting(scene, "window")
+
+
+def _setting(scene: bpy.types.Scene, name: str) -> bool:
+    """A switch of the preview of this scene; a command has no panel to set it."""
+    return bool(getattr(getattr(scene, "prt", None), name, False))
 
 
 def _remarks(scene: bpy.types.Scene, headers: dict[str, dict]) -> list[str]:

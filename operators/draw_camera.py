@@ -16,13 +16,14 @@ from .relit import draw_lit, read_all, relit
 
 
 def draw_to_file(scene: bpy.types.Scene, path: Path, size: tuple[int, int], environment: Path | None = None,
-                 rotate: float = 0.0, window: bool = False, warn: Callable[[str], None] = lambda _: None) -> None:
+                 rotate: float = 0.0, window: bool = False, warn: Callable[[str], None] = lambda _: None,
+                 by_directions: bool = False) -> None:
     """Draw the active camera's view of the bakes into a PNG, size (width, height); the sky behind them unless the
-    scene's film is transparent. environment, rotate, window: as for `relit`. Raises PRTError."""
+    scene's film is transparent. environment, rotate, window, by_directions: as for `relit`. Raises PRTError."""
     from ..gpu_shaders import offscreen  # a machine without a graphics driver can do all else
 
     baked = read_all(scene, scene.name)
-    lit = relit(scene, baked, environment, rotate, True, window)
+    lit = relit(scene, baked, environment, rotate, True, window, by_directions=by_directions)
     for warning in lit.warnings:
         warn(warning)
     background = None
@@ -77,7 +78,7 @@ class PRT_OT_draw_camera(bpy.types.Operator):
             size = size_of(self.size) if self.size else size_in(scene)
             window = self.window if self.properties.is_property_set("window") else scene.prt.window
             draw_to_file(scene, path, size, path_of(self.environment) if self.environment else None, self.rotate,
-                         window, lambda warning: self.report({"WARNING"}, warning))
+                         window, lambda warning: self.report({"WARNING"}, warning), scene.prt.lamps_by_directions)
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -67,7 +67,8 @@ def write_frame(scene: bpy.types.Scene) -> list[str]:
     baked, notes = _readable(scene)
     if not baked:
         return notes or ["nothing is baked"]
-    lit = relit(scene, baked, window=scene.prt.window, scene_lamps=_follower.lamps)
+    lit = relit(scene, baked, window=scene.prt.window, scene_lamps=_follower.lamps,
+                by_directions=scene.prt.lamps_by_directions)
     colours = {name: lit.radiance(name, transfer) for name, transfer in baked.items()}
     for name, radiance in colours.items():
         if not np.isfinite(radiance).all():

@@ -20,9 +20,10 @@ from .bake_request import BakeRequest
 from .bake_session import BakeSession
 from .compare_session import CompareRequest, CompareSession
 from .properties import assign, session
+from .tracing_choice import MeasureRequest, MeasureSession
 
-Request = BakeRequest | CompareRequest
-Job = BakeSession | CompareSession
+Request = BakeRequest | CompareRequest | MeasureRequest
+Job = BakeSession | CompareSession | MeasureSession
 POLL_SECONDS = 0.2  # each tick redraws the sidebar
 ENDED_LINES = 6  # of earlier bakes of a queue that the panel shows
 
@@ -39,6 +40,7 @@ STAGES = {
     "encode": "Compressing",
     "errors": "Measuring the error",
     "cycles": "Rendering with Cycles",
+    "measure": "Measuring ray tracing",
 }
 
 

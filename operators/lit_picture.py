@@ -38,7 +38,7 @@ def lit_picture(context: bpy.types.Context) -> NDArray[np.uint8] | None:
     from ..gpu_shaders.render_data import DrawItem  # a machine without a graphics driver has all the rest
     from ..gpu_shaders.thumbnail import draw_thumbnail
 
-    lit = relit(scene, baked, window=scene.prt.window)
+    lit = relit(scene, baked, window=scene.prt.window, by_directions=scene.prt.lamps_by_directions)
     items = [DrawItem(name, b, lit.moved[name], lit.light[name], 2.0 ** scene.prt.exposure, name in old,
                       direct=lit.direct[name], textures=surface_textures(scene.objects[name], b, depsgraph))
              for name, b in baked.items()]

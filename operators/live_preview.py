@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..gpu_shaders import viewport
 from ..gpu_shaders.occluders import Occluder
 from ..gpu_shaders.overlay import Marks
-from ..gpu_shaders.render_data import DrawItem, transfer_signature
+from ..gpu_shaders.render_data import DrawItem, LampScattering, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.image_albedo import surface_textures, textures_key
 from ..prt_addon.blender.lights import distant_light
@@ -47,6 +47,8 @@ from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
+from .live_bodies import body_lines, lamp_light
+from .live_materials import LiveMaterials
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
 
@@ -78,6 +80,7 @@ class Shown:
     local: NDArray[np.float64] | None = None
     stale: bool = False
     direct: NDArray[np.float32] | None = None
+    scattering: LampScattering | None = None
     moved: NDArray[np.float64] | None = None
     textures: SurfaceTextures | None = None
     textures_key: Hashable = None
@@ -125,6 +128,8 @@ class Live:
     stale_seconds: float = 0.0
     stale_due: float = 0.0
     display: Display = field(default_factory=Display)
+    materials: LiveMaterials = field(default_factory=LiveMaterials)
+    materials_dirty: bool = True
     bakes_dirty: bool = True
     list_dirty: bool = True  # objects may have come or gone
     light_dirty: bool = True
@@ -156,7 +161,7 @@ _live = _OfContext()
 def bakes_changed() -> None:
     """Baked data was written or removed: read it again soon."""
     for live in _lives.values():
-        live.bakes_dirty = live.light_dirty = live.stale_dirty = True
+        live.bakes_dirty = live.light_dirty = live.stale_dirty = live.materials_dirty = True
         live.stale_due = 0.0
     _schedule(SHORTEST_WAIT)
 
@@ -172,6 +177,7 @@ def enable() -> None:
     """Show baked objects in all viewports. Raises PRTError where their data or the light can't be read."""
     _read_bakes()
     _read_light()
+    _read_materials()
     viewport.enable(draw_list, shows_everything, labels, occluders, marks)
     assign(session(), preview=True)
     _tell_panel()
@@ -180,14 +186,14 @@ def enable() -> None:
 def disable() -> None:
     """Back to Blender's own picture."""
     viewport.disable()
-    assign(session(), preview=False, preview_message="")
+    assign(session(), preview=False, preview_message="", live_materials="")
 
 
 def settled() -> bool:
     """Whether nothing is left to be done: what was noted is evaluated, no light fades, no soft shadow is coarse."""
     preview = session().preview
-    return not any(live.bakes_dirty or live.stale_dirty or live.moving or (preview and live.light_dirty)
-                   for live in _lives.values())
+    return not any(live.bakes_dirty or live.stale_dirty or live.moving or
+                   (preview and (live.light_dirty or live.materials_dirty)) for live in _lives.values())
 
 
 def draw_list() -> list[DrawItem]:
@@ -205,15 +211,22 @@ def draw_list() -> list[DrawItem]:
         if found is None or not _is_drawn(found, space):
             continue
         moved = transform_since_bake(found, shown.baked.header, _placed(found, shown.local))
-        basis = shown.baked.lighting_basis
-        light = joined_light(basis, _light_in(basis, moved), _live.lamps.cloud_light(shown.baked, shown.moved))
-        painted = colours.get(name)
-        items.append(DrawItem(shown.key, shown.baked, moved, light, 1.0 if painted else exposure, shown.stale,
-                              direct=shown.direct, colours=painted, textures=shown.textures))
+        light = _light_on(shown, moved)
+        painted, edited = colours.get(name), _live.materials.edited.get(name)
+        key, baked, direct = (shown.key, shown.baked, shown.direct) if edited is None else (
+            edited.key, edited.baked, edited.with_direct(shown.direct))
+        items.append(DrawItem(key, baked, moved, light, 1.0 if painted else exposure, shown.stale,
+                              direct=direct, colours=painted, textures=shown.textures, scattering=shown.scattering))
     if len(owners) < len(_live.owners):  # one was renamed or removed, which Blender may not tell
         _live.bakes_dirty = True
         _schedule(SHORTEST_WAIT)
     return items
+
+
+def _light_on(shown: Shown, moved: NDArray[np.float64]) -> NDArray[np.float32]:
+    """All light on an object in the columns of its bake."""
+    basis = shown.baked.lighting_basis
+    return joined_light(basis, _light_in(basis, moved), _live.lamps.cloud_light(shown.baked, shown.moved))
 
 
 def _placed(owner: bpy.types.Object, local: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
@@ -340,13 +353,23 @@ def _read_bakes() -> None:
             key = _context_key(), name, transfer_signature(baked)
             _live.shown[name] = Shown(baked, key, owner.name_full, local)
     _live.owners = {shown.owner for shown in _live.shown.values()}
+    _live.materials.read(_live.shown, _own_objects())
+    _live.materials_dirty = True
     _read_stale()
+
+
+def _own_objects() -> dict[str, bpy.types.Object]:
+    """The scene's objects that are shown, by name, without instances."""
+    layer = bpy.context.view_layer.objects
+    return {name: layer[shown.owner] for name, shown in _live.shown.items()
+            if shown.local is None and shown.owner in layer}
 
 
 def _tell_panel() -> None:
     """Pass on to the panel what is known of the scene of this context."""
     state = session()
     assign(state, cloud="\n".join(_cloud_lines()), preview_message=_live.message if state.preview else "",
+           live_materials=_live.materials.message if state.preview else "",
            last_bake=_last_bake(bpy.context.scene.get(REPORT_PROPERTY, "")) if _live.lines else "")
     if [line.name for line in state.objects] != [line.name for line in _live.lines]:
         state.objects.clear()
@@ -379,7 +402,7 @@ def _cloud_lines() -> list[str]:
         if len(owners) > 1:
             lines.append(f"{names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}:")
         lines += cloud_lines(_live.shown[names[0]].baked.cloud).splitlines()
-    return lines
+    return lines + body_lines(_live.lamps, _live.shown)
 
 
 def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
@@ -408,9 +431,12 @@ def _read_stale() -> None:
     started = time.perf_counter()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
+    followed = surroundings(depsgraph, follow=True) if _live.materials.present else around
     if around != _live.around:
         _live.around = around
         _live.lamps.forget_geometry()
+        _live.materials.forget_geometry()
+        _live.materials_dirty = True
     bakes, changed = _bakes_here(), False
     for line in _live.lines:
         shown = _live.shown.get(line.name)
@@ -419,7 +445,8 @@ def _read_stale() -> None:
         found, owner, local = bakes[line.name]
         matrix, before = _placed(owner, local), (shown.stale, shown.moved)
         try:
-            line.stale = stale(found, depsgraph, around, matrix) or ""
+            follow = _live.materials.follows(line.name)
+            line.stale = stale(found, depsgraph, followed if follow else around, matrix, follow) or ""
         except PRTError as error:
             line.stale = str(error)
         shown.stale = bool(line.stale)
@@ -440,15 +467,18 @@ def _read_light() -> None:
         _live.signature, _live.light, _live.message = None, None, ""
         return
     started, depsgraph = time.perf_counter(), bpy.context.evaluated_depsgraph_get()
-    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values())
+    name_lamps = all(shown.baked.cloud is None for shown in _live.shown.values()) and \
+        not bpy.context.scene.prt.lamps_by_directions
     distant, warnings, signature = distant_light(
         bpy.context.scene, depsgraph, (shown.baked.lighting_basis for shown in _live.shown.values()),
         window=bpy.context.scene.prt.window, name_lamps=name_lamps)
     _read_lamps(depsgraph, warnings)
+    _read_far_lamps(depsgraph, warnings)
     _live.light_seconds = time.perf_counter() - started
     _live.message = "\n".join(dict.fromkeys(warnings))
     if signature != _live.signature:
         _live.signature, _live.light, _live.rotated = signature, distant, {}
+        _live.materials_dirty = True
         viewport.redraw()
 
 
@@ -461,14 +491,43 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     _live.lamps_time = now
     _note_moves(lamps, now)
     signature = lamps_signature(lamps), frozenset(_live.moving)
-    if signature != _live.lamps_signature or any(
+    fading = not _live.lamps.settled and any(shown.baked.links is not None for shown in _live.shown.values())
+    if fading or signature != _live.lamps_signature or any(
             shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature = signature
         for name, shown in _live.shown.items():
-            shown.direct = _live.lamps.direct(name, shown.baked, lamps, _live.moving, shown.moved)
+            shown.direct, shown.scattering = lamp_light(_live.lamps, name, shown, lamps, _live.moving)
+        _live.materials_dirty = True
         viewport.redraw()
     if not _live.lamps.settled:
         _live.light_dirty = True
+        viewport.redraw()
+
+
+def _read_far_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
+    """Let lamps light bakes without columns of their own, where that is asked for."""
+    settings, outside = bpy.context.scene.prt, []
+    bakes = {name: shown.baked for name, shown in _live.shown.items() if shown.baked.cloud is None}
+    if settings.lamps_by_directions and bakes:
+        owners = {name: _live.shown[name].owner for name in bakes}
+        outside = _live.lamps.far.step(bakes, depsgraph, warnings, owners)
+    for name, baked in bakes.items():
+        shown = _live.shown[name]
+        direct = _live.lamps.far.direct(name, baked, outside, settings.window, shown.moved)
+        if direct is not shown.direct:
+            shown.direct = direct
+            viewport.redraw()
+
+
+def _read_materials() -> None:
+    """Let bounced light follow the materials, where bakes kept what that needs."""
+    _live.materials_dirty = False
+    if not _live.materials.present or _live.signature is None:
+        return
+    owners = _own_objects()
+    lights = {name: _light_on(_live.shown[name], transform_since_bake(found, _live.shown[name].baked.header))
+              for name, found in owners.items()}
+    if _live.materials.step(_live.shown, owners, lights, bpy.context.evaluated_depsgraph_get()):
         viewport.redraw()
 
 
@@ -547,6 +606,8 @@ def _follow() -> float | None:
             _read_stale()
         if _live.light_dirty and session().preview:
             _read_light()
+        if _live.materials_dirty and session().preview:
+            _read_materials()
     except PRTError as error:
         _live.message = str(error)
     if _live.light_dirty and session().preview:  # light that fades
@@ -570,7 +631,7 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 
 def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
     """Note what a depsgraph's updates may have changed. light: whether that has changed for certain."""
-    geometry = asked = reshaped = False
+    geometry = asked = reshaped = materials = False
     for update in depsgraph.updates:
         changed = update.id
         reshaped |= update.is_updated_geometry
@@ -580,15 +641,20 @@ def _note(depsgraph: bpy.types.Depsgraph, light: bool = False) -> None:
         elif isinstance(changed, bpy.types.Object):
             light |= changed.type == "LIGHT"
             geometry |= changed.type in SURFACE_TYPES or changed.instance_type != "NONE"
+            materials |= changed.type in SURFACE_TYPES  # another material in a slot
         elif isinstance(changed, SURFACE_DATA):
             geometry = True
+            materials |= isinstance(changed, bpy.types.Material)
     now = time.perf_counter()
     for live in _lives.values():
         live.light_dirty |= light
+        live.materials_dirty |= materials and live.materials.present
         live.list_dirty |= asked
         live.geometry += reshaped
         if geometry and not live.stale_dirty:
             live.stale_dirty, live.stale_due = True, now + max(STALE_WAIT, 4.0 * live.stale_seconds)
+    if materials and session().preview and any(live.materials_dirty for live in _lives.values()):
+        _schedule(max([SHORTEST_WAIT, *(live.materials.seconds for live in _lives.values())]))
     if light and session().preview:
         _schedule(max([SHORTEST_WAIT, *(live.light_seconds for live in _lives.values())]))
     elif geometry or asked:

@@ -59,12 +59,23 @@ ENCODER_ITEMS = (
                              "twice the time", 2),
     ("eigentransport", "Eigentransport", "One basis for all receivers, with more vectors. Relights fast; needs about a "
                                          "hundred vectors, and blurs or rings in hard shadows", 3),
+    ("auto", "Automatic", "Clusters; of a cubemap eigentransport where that shows the present light as exactly for "
+                          "less time and data. Analyze tells which", 4),
 )
 DISTANT_BASIS_ITEMS = (
     ("sh", "Spherical Harmonics", "Smooth functions: small, fast, with highlights and translucency. A sun's shadows "
                                   "are as soft as the order says", 0),
     ("cubemap", "Cubemap", "The texels of a cubemap: shadows of suns as sharp as a texel. Costs several times the time "
-                           "and memory; diffuse light only, metal is black", 1),
+                           "and memory; highlights several times as much again", 1),
+    ("auto", "Automatic", "Harmonics or a cubemap, as large as the present light needs for the asked error. Costs a "
+                          "second; a sharper light that comes later is shown blurred. Analyze tells what and why", 2),
+)
+SAMPLING_ITEMS = (
+    ("automatic", "Automatic", "All texels, unless fewer are surely faster and exact enough. The report says why", 0),
+    ("every", "Every Element", "Rays for all texels at all receivers. No error, and mostly the fastest", 1),
+    ("sparse", "Sparse", "Rays for about an eighth of them; the rest is woven from neighbours. Up to twice as fast "
+                         "for detailed meshes, slower for simple ones. Adds about 1 % of error; the report states it",
+     2),
 )
 RECEIVERS_ITEMS = (
     ("vertices", "Vertices", "Light is kept at the mesh's vertices, and between them on faces longer than Longest "
@@ -80,12 +91,13 @@ TARGET_ITEMS = (
 )
 # What presets differ in, and so fill in; the rest belongs to the scene rather than to the quality, and stays.
 QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing", "encoder", "clusters", "vectors",
-           "compression_error", "error_receivers", "error_paths", "glossy_rows", "glossy_albedo", "surface_patches",
+           "compression_error", "error_receivers", "error_paths", "glossy_rows", "glossy_albedo", "light_error",
+           "surface_patches",
            "surface_columns", "cloud_lights", "merge_response")
 # What goes into a bake under its own name.
-OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "coherence", "lamp_basis", "cloud_spacing", "cloud_emission",
-             "distant_basis", "cubemap_size", "memory_budget", "receivers", "atlas_size",
-             "zone_receivers", "fit_order_to_light", "threads", "seed")
+OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "subsurface_links", "coherence", "lamp_basis", "cloud_spacing",
+             "cloud_emission", "distant_basis", "cubemap_size", "sampling", "memory_budget", "receivers", "atlas_size",
+             "zone_receivers", "fit_order_to_light", "live_editing", "live_entries", "threads", "seed")
 ROUNDING = 1e-6  # of single precision
 
 
@@ -139,10 +151,20 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Sky By", items=DISTANT_BASIS_ITEMS, default=PRESETS["standard"].distant_basis,
         description="What World and Suns are baked in",
     )
+    light_error: FloatProperty(
+        name="Light Error", min=1e-3, max=1.0, soft_max=0.3, precision=3, step=0.5,
+        default=PRESETS["standard"].light_error,
+        description="Share of the shadows of the present light that an automatic sky may lose (relative RMS). Lower "
+                    "buys sharper shadows; time and data grow, under a sun many times",
+    )
     cubemap_size: IntProperty(
         name="Texels", min=2, max=32, default=PRESETS["standard"].cubemap_size,
         description="Along each edge of the cubemap. Twice as many show shadows twice as sharp; time, memory and disk "
                     "grow with the square",
+    )
+    sampling: EnumProperty(
+        name="Shadow Samples", items=SAMPLING_ITEMS, default=PRESETS["standard"].sampling,
+        description="Of a cubemap's texels, which get rays from which receivers",
     )
     memory_budget: FloatProperty(
         name="Memory", min=0.0, soft_max=64.0, precision=1, default=PRESETS["standard"].memory_budget,
@@ -167,6 +189,12 @@ class PRTSettings(bpy.types.PropertyGroup):
         name="Show Light Cloud", update=_redraw, default=False,
         description="Marks the lights of the light cloud (grey; merged ones in their zone's colour), or the patches of "
                     "the surfaces that lamps shine on. Costs some drawing while on, nothing while off",
+    )
+    lamps_by_directions: BoolProperty(
+        name="Lamps from Afar", update=_light_changed, default=False,
+        description="Point, Spot and Area lamps light bakes made without local lights, by the directions nearest to "
+                    "them. Only lamps outside the hull of the scene: from 3 radii of the object on as exact as a Sun, "
+                    "at 1.5 radii 14 % off beside a ground. Costs some milliseconds a lamp",
     )
     window: BoolProperty(
         name="Soften Ringing", update=_light_changed, default=False,
@@ -267,13 +295,31 @@ class PRTSettings(bpy.types.PropertyGroup):
     )
     glossy_window: BoolProperty(
         name="Soften Sharp Ones", default=PRESETS["standard"].glossy_window,
-        description="Highlights sharper than the order of the light reflect a softer light. Buys highlights without "
-                    "dark rings, costs some of their sharpness and no time",
+        description="Highlights sharper than the light's order, or with a cubemap than their functions, reflect a "
+                    "softer light. Buys highlights without dark rings, costs some of their sharpness and no time",
     )
     subsurface: BoolProperty(
         name="Translucency", default=PRESETS["standard"].subsurface,
         description="Light that travels through skin, wax and marble. Costs seconds and three colour channels where a "
                     "material has subsurface light, and nothing elsewhere",
+    )
+    subsurface_links: IntProperty(
+        name="Lamp Links", min=0, max=256, default=PRESETS["standard"].subsurface_links,
+        description="Lets the light of lamps travel through skin, wax and marble while they move. Each point of such a "
+                    "material gathers from so many patches of its surface: 16 show blocks, 64 are smooth. Costs 16 "
+                    "bytes per point and link in the file and on the graphics card: 64 links of 50,000 points are "
+                    "51 MB and 10 seconds of the bake. 0 is off",
+    )
+    live_editing: BoolProperty(
+        name="Live Materials", default=PRESETS["standard"].live_editing,
+        description="Bounced light in the preview follows base colours and emission that you change later, without a "
+                    "new bake. Costs half a MB of data for 1,000 receivers at 64 Entries, hardly any time, and a "
+                    "separate mesh for objects of several materials",
+    )
+    live_entries: IntProperty(
+        name="Entries", min=8, max=1024, soft_max=256, default=PRESETS["standard"].live_entries,
+        description="What each receiver remembers of the surfaces that it sees. More follow edits more exactly; each "
+                    "costs 8 bytes, and time at every edit",
     )
     coherence: FloatProperty(
         name="Coherence", min=0.0, max=0.5, precision=3, default=PRESETS["standard"].coherence,
@@ -400,6 +446,7 @@ class PRTSession(bpy.types.PropertyGroup):
     failed: BoolProperty()
     preview: BoolProperty()
     preview_message: StringProperty()
+    live_materials: StringProperty()
     viewport_message: StringProperty()
     objects: CollectionProperty(type=PRTBakedObject)
     cloud: StringProperty()

@@ -60,7 +60,7 @@ class PRT_OT_relight(bpy.types.Operator):
             baked = read_all(scene, scene.name)
             window = self.window if self.properties.is_property_set("window") else scene.prt.window
             lit = relit(scene, baked, path_of(self.environment) if self.environment else None, self.rotate,
-                        self.use_scene_lights, window)
+                        self.use_scene_lights, window, by_directions=scene.prt.lamps_by_directions)
             if self.filepath:
                 save_arrays(path_of(self.filepath), radiance_arrays(baked, lit))
             objects = dict(zip(baked, find_objects(list(baked), scene), strict=True))

@@ -59,23 +59,28 @@ def read_all(scene: bpy.types.Scene, subject: str) -> dict[str, BakedTransfer]:
 
 def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: Path | None = None,
           rotate: float = 0.0, use_scene_lights: bool = True, window: bool = False,
-          scene_lamps: SceneLamps | None = None) -> Lit:
+          scene_lamps: SceneLamps | None = None, by_directions: bool = False) -> Lit:
     """The light of the scene on its bakes; arguments as those of `light_coefficients`.
 
-    scene_lamps: kept by the caller from one light to the next, who tells it when geometry changes.
+    scene_lamps: kept by the caller from one light to the next, who tells it when geometry changes. by_directions:
+    lamps light bakes of distant light, too, by the nearest directions.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()
     distant, warnings, _ = distant_light(scene, depsgraph, (b.lighting_basis for b in baked.values()), environment,
-                                         rotate, use_scene_lights, window, all(b.cloud is None for b in baked.values()))
+                                         rotate, use_scene_lights, window,
+                                         not by_directions and all(b.cloud is None for b in baked.values()))
     objects = find_objects(list(baked), scene)
     moved = {name: transform_since_bake(found, baked[name].header) for name, found in zip(baked, objects, strict=True)}
     scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
+    outside = scene_lamps.far.step(baked, depsgraph, warnings) if by_directions and use_scene_lights else []
     light, direct = {}, {}
     for name, b in baked.items():
         seen = distant_light_in(distant, b.lighting_basis, moved[name])
         light[name] = joined_light(b.lighting_basis, seen, scene_lamps.cloud_light(b, moved[name]) if lamps else None)
         direct[name] = scene_lamps.direct(name, b, lamps, moved=moved[name]) if lamps else None
+        if outside and b.cloud is None:
+            direct[name] = scene_lamps.far.direct(name, b, outside, window, moved[name])
     return Lit(light, direct, moved, tuple(dict.fromkeys(warnings)))
 
 

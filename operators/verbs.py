@@ -73,6 +73,8 @@ def relight(arguments: argparse.Namespace) -> Iterator[str]:
     Where radiance depends on the view, it is that towards the normal.
     """
     _check_output(arguments.output, (".npz",), arguments.input)
+    if arguments.lamps_by_directions and not arguments.use_scene_lights:
+        raise BadArguments("--lamps-by-directions", "the scene's lamps are not asked for", "Add --use-scene-lights")
     scene = _open(arguments.input)
     baked = read_all(scene, str(arguments.input))
     lit = _lit(scene, baked, arguments, arguments.use_scene_lights)
@@ -86,7 +88,7 @@ def preview(arguments: argparse.Namespace) -> Iterator[str]:
     _check_angle(arguments.rotate)
     scene = _open(arguments.input)
     draw_to_file(scene, arguments.output, arguments.size or size_in(scene), arguments.environment, arguments.rotate,
-                 arguments.window, _warn)
+                 arguments.window, _warn, arguments.lamps_by_directions)
     yield str(arguments.output)
 
 
@@ -203,7 +205,8 @@ def _lit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], arguments: arg
          use_scene_lights: bool) -> Lit:
     """The light that the arguments ask for, with its warnings on stderr."""
     _check_angle(arguments.rotate)
-    lit = relit(scene, baked, arguments.environment, arguments.rotate, use_scene_lights, arguments.window)
+    lit = relit(scene, baked, arguments.environment, arguments.rotate, use_scene_lights, arguments.window,
+                by_directions=arguments.lamps_by_directions)
     for warning in lit.warnings:
         _warn(warning)
     return lit

@@ -9,6 +9,7 @@ from .jobs import draw_interrupted, draw_jobs, draw_messages
 from .layout import Sidebar, plural, wrapped
 
 CASTING = "more mesh casts shadows and bounces", "more meshes cast shadows and bounce"  # one, several
+SIZES = {"sh": "order", "cubemap": "cubemap_size", "auto": "light_error"}  # what a kind of sky is made finer by
 NAMES = 3  # of objects that are told
 TOLD_AS = {"Left out:": "REMOVE", "Bake:": "ERROR"}  # icons of an analysis' lines by how they start
 
@@ -39,7 +40,7 @@ class PRT_PT_bake(Sidebar, bpy.types.Panel):
         distant = column.column()
         distant.active = settings.lighting != "local"  # columns of lamps know no order
         distant.prop(settings, "distant_basis")
-        distant.prop(settings, "cubemap_size" if settings.distant_basis == "cubemap" else "order")
+        distant.prop(settings, SIZES[settings.distant_basis])
         column.prop(settings, "bounces")
         row = layout.row(align=True)
         row.operator("prt.bake", text="Bake Next" if session.running else "Bake", icon="RENDER_STILL")

@@ -7,6 +7,8 @@ import bpy
 
 from .layout import Sidebar, wrapped
 
+LOUD = ("outside the light cloud", "inside the hull")  # of lamps that light less than they seem to
+
 
 class PRT_PT_preview(Sidebar, bpy.types.Panel):
     """The viewport's picture under the present light."""
@@ -26,11 +28,14 @@ class PRT_PT_preview(Sidebar, bpy.types.Panel):
         _explain(column, context)
         column.prop(context.scene.prt, "exposure")
         column.prop(context.scene.prt, "window")
+        column.prop(context.scene.prt, "lamps_by_directions")
         row = column.row()
         row.active = bool(session.cloud)
         row.prop(context.scene.prt, "show_cloud")
         for line in session.preview_message.splitlines():
-            wrapped(layout, context, line, "ERROR" if "outside the light cloud" in line else "INFO")
+            wrapped(layout, context, line, "ERROR" if any(part in line for part in LOUD) else "INFO")
+        if session.live_materials:
+            wrapped(layout, context, session.live_materials, "MATERIAL")
         for line in session.viewport_message.splitlines():
             wrapped(layout, context, line, "INFO")
         layout.operator("prt.relight", icon="GROUP_VCOL")

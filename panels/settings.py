@@ -42,12 +42,14 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
-        if settings.distant_basis == "cubemap":
+        if settings.distant_basis != "sh":
+            distant.prop(settings, "sampling")
             distant.prop(settings, "memory_budget")
-        else:
+        if settings.distant_basis == "sh":
             distant.prop(settings, "fit_order_to_light")
         column.prop(settings, "threads")
         column.prop(settings, "seed")
+        self.layout.operator("prt.measure_tracing", icon="SORTTIME")
 
 
 class PRT_PT_highlights(_Expert, bpy.types.Panel):
@@ -58,13 +60,15 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
-        column.active = settings.distant_basis == "sh" or settings.lighting == "local"  # a cubemap holds none
         column.prop(settings, "glossy_rows")
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
         shiny.prop(settings, "glossy_albedo")
         shiny.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
+        lamps = column.column()
+        lamps.active = settings.lighting != "environment"
+        lamps.prop(settings, "subsurface_links")
 
 
 class PRT_PT_local_lights(_Expert, bpy.types.Panel):

@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..compression.encoding import Encoding
+from ..lighting.reference_light import ReferenceLight
+from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
 from ..transport.column_arrays import COLUMNS_AT_ONCE, column_array, column_blocks
 from ..transport.cubemap_transfer import bounced_columns, cubemap_transfer
 from ..transport.interreflection import Interreflection
 from ..transport.receiver_set import ReceiverSet
+from ..transport.texel_elements import TexelElements
+from ..transport.texel_visibility import TexelVisibility
 from .distant_basis import DistantBasis, array_budget
+from .sampling import SampledDirect, choose, sparse_direct
 from .settings import BakeSettings
 
 Single = NDArray[np.float32]
@@ -37,12 +42,19 @@ def is_kept(transfer: Single, settings: BakeSettings) -> bool:
     return budget is None or transfer.nbytes <= budget
 
 
-def direct_cubemap(tracer: Tracer, receivers: ReceiverSet, basis: DistantBasis, settings: BakeSettings,
-                   shadow_rays: bool, folder: Path | None) -> Generator[float, None, Single]:
-    """Yield progress, return direct transfer (r, columns)."""
-    transfer = yield from cubemap_transfer(tracer, receivers, basis.cubemap, basis.samples(settings.directions),
-                                           shadow_rays, array_budget(settings), folder)
-    return transfer.T
+def direct_cubemap(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, basis: DistantBasis,
+                   settings: BakeSettings, shadow_rays: bool, light: ReferenceLight | None, folder: Path | None,
+                   plain: TexelVisibility | None = None) -> Generator[float, None, SampledDirect]:
+    """Yield progress, return direct transfer (r, columns) of every element, or woven from a part of them. plain:
+    collects what receivers with highlights see, which takes every element."""
+    samples = basis.samples(settings.directions)
+    elements = TexelElements(tracer, receivers, basis.cubemap, samples)
+    sparsely, left_out = choose(elements, settings, shadow_rays, plain is not None)
+    if sparsely:
+        return (yield from sparse_direct(elements, scene, basis, settings, light, folder))
+    transfer = yield from cubemap_transfer(tracer, receivers, basis.cubemap, samples, shadow_rays,
+                                           array_budget(settings), folder, plain)
+    return SampledDirect(transfer.T, None, {}, left_out)
 
 
 def bounced_cubemap(matrix: sparse.csr_matrix, albedo: Single, direct: Single, settings: BakeSettings,

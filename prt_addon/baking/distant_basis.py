@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from ..basis.cubemap import cubemap_solid_angles, texel_of
 from ..basis.spherical_harmonics import evaluate
-from ..lighting.cubemap_light import environment_texels, sun_texels
+from ..lighting.bright_light import BrightCells, bright_texels
+from ..lighting.cubemap_light import Turn, environment_texels, sun_texels
 from ..lighting.reference_light import ReferenceLight
+from ..lighting.windowing import for_highlights
 from ..linear_algebra import multiply
+from ..reporting.wording import count, plural
 from ..storage.columns import Columns
 from .settings import BakeSettings
 
@@ -40,6 +43,19 @@ class DistantBasis:
         """How many there are."""
         return self.entry().distant
 
+    @property
+    def facts(self) -> dict[str, int]:
+        """For JSON: the order, or the texels along an edge of the cubemap; and the columns."""
+        size = {"cubemap_size": self.cubemap} if self.cubemap else {"order": self.order}
+        return {**size, "columns": self.columns}
+
+    @property
+    def words(self) -> str:
+        """The same in a line for a person."""
+        if self.cubemap:
+            return f"Sky by a cubemap of 6 x {self.cubemap} x {self.cubemap} texels: {count(self.columns)} columns"
+        return f"Sky by spherical harmonics of order {self.order}: {plural(self.columns, 'column', 'columns')}"
+
     def entry(self, local: int = 0) -> Columns:
         """For the header, with so many columns of local light behind."""
         return Columns(self.order, local, self.cubemap)
@@ -60,6 +76,16 @@ class DistantBasis:
             return transfer[:, :self.columns].sum(axis=1, dtype=np.float64)
         return transfer[:, 0].astype(np.float64) * np.sqrt(4.0 * np.pi)
 
+    def white_light(self) -> Double:
+        """The light (columns, 3) of a white world of radiance 1."""
+        if self.cubemap:
+            return np.ones((self.columns, 3))
+        return np.concatenate([np.full((1, 3), np.sqrt(4.0 * np.pi)), np.zeros((self.columns - 1, 3))])
+
+    def for_highlights(self, coefficients: Double) -> Double:
+        """The light (columns, 3) as highlights reflect it: texels do not ring, harmonics get a window."""
+        return coefficients if self.cubemap else for_highlights(coefficients)
+
     def scale(self) -> NDArray[np.float32] | None:
         """(columns,) what columns are multiplied by while they are encoded, so that sums of squares are integrals over
         the sphere; None where they are already."""
@@ -70,10 +96,17 @@ class DistantBasis:
         if not self.cubemap:
             return light.coefficients(self.order)
         total = environment_texels(light.image, self.cubemap)
+        if light.is_turned:  # as it is drawn, a turn's blur included
+            total = Turn(self.cubemap, light.rotation)(total)
         for direction, irradiance, angle in zip(light.sun_directions, light.sun_irradiance, light.sun_angles,
                                                 strict=True):
             total = total + sun_texels(direction, irradiance, float(angle), self.cubemap)
         return total
+
+    def split(self, coefficients: Double, value: int) -> tuple[BrightCells | None, Double]:
+        """Bright parts of the columns' light, to be sampled for this value of a reference, and the light (columns, 3)
+        without them."""
+        return bright_texels(coefficients, self.cubemap, value) if self.cubemap else (None, coefficients)
 
     def radiance(self, coefficients: Double, directions: Double) -> Double:
         """Radiance (n, 3) that the columns' light stands for, in unit directions (n, 3)."""

@@ -6,8 +6,8 @@ The chain from what is drawn to the truth, each step a difference of two picture
 compression  decoded rows          - rows as baked
 sampling     rows as baked         - the same rows filled with independent rays (the material's matrix applied to
                                      measured incident radiance)
-rows         these                 - the true highlight, no basis of views, under the light at the bake's own order
-basis        that                  - under the full light (what the order leaves out, and a window against ringing)
+rows         these                 - the true highlight, no basis of views, under the light in the bake's own columns
+basis        that                  - under the full light (what order or texels leave out, and a window against ringing)
 bounces      that                  - with the true highlights of all surfaces along every path
 total        decoded rows          - that
 
@@ -30,11 +30,11 @@ from ..basis.directions import disc_directions, tangent_frames
 from ..basis.hemisphere import Indices
 from ..basis.spherical_harmonics import evaluate, order_of
 from ..lighting.reference_light import ReferenceLight
-from ..lighting.windowing import for_highlights
 from ..linear_algebra import batched_multiply, multiply
 from ..transport.glossy import surface_frames
 from ..transport.path_reference import PATHS_AT_ONCE, DistantSuns
 from ..transport.receiver_set import ReceiverSet
+from .distant_basis import DistantBasis
 from .error_budget import by_object, summary
 from .highlight_reference import ALL_HITS, TrueSurfaces, arriving_radiance
 from .highlight_sampling import (
@@ -52,7 +52,7 @@ Array = NDArray[np.float64]
 VIEWS = 8
 # Directions over a sun's disc that each view is lit from.
 SUN_DIRECTIONS = 64
-# Values along a path: light at the bake's order, full light. Depths: recorded bounces, all bounces.
+# Values along a path: light in the bake's columns, full light. Depths: recorded bounces, all bounces.
 BANDED, FULL = 0, 1
 RECORDED, ALL = 0, 1
 
@@ -75,7 +75,7 @@ class HighlightSample:
 @dataclass(frozen=True)
 class Measured:
     """Of k receivers in the two halves: band, recorded, full (2, k, views, 3) true highlights; incident (2, k, n^2, 3)
-    integrals of what arrives, at the bake's order and bounces."""
+    integrals of what arrives, in the bake's columns and bounces."""
 
     band: Array
     recorded: Array
@@ -83,8 +83,8 @@ class Measured:
     incident: Array
 
 
-def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: ReferenceLight, order: int, bounces: int,
-                     recorded: int, paths: int, seed: int, soft: bool = False,
+def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: ReferenceLight, basis: DistantBasis,
+                     bounces: int, recorded: int, paths: int, seed: int, soft: bool = False,
                      ) -> Generator[float, None, dict[str, Any]]:
     """Yield progress, return an entry (see `error_budget.summary`) of each step of the chain above.
 
@@ -97,7 +97,7 @@ def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: Ref
     frames = surface_frames(scene.normals[sample.keys], scene.tangents[sample.keys])
     generator = np.random.Generator(np.random.PCG64([seed, 79]))
     views = cosine_directions(lattice(len(sample.keys), VIEWS, generator)).reshape(-1, VIEWS, 3)
-    task = Measurement(surfaces, receivers, frames, views, light, order, bounces, (recorded, ALL_HITS), paths, seed,
+    task = Measurement(surfaces, receivers, frames, views, light, basis, bounces, (recorded, ALL_HITS), paths, seed,
                        soft)
     before = tracer.rays
     measured = yield from measure(task, scene.material[sample.keys])
@@ -159,7 +159,7 @@ class Measurement:
     frames: Array
     views: Array
     light: ReferenceLight
-    order: int
+    basis: DistantBasis
     bounces: int
     glossy_hits: tuple[int, int]
     paths: int
@@ -168,9 +168,9 @@ class Measurement:
 
     @property
     def reflected(self) -> Array:
-        """The light at the bake's order as its highlights reflect it, (order^2, 3)."""
-        coefficients = self.light.coefficients(self.order)
-        return for_highlights(coefficients) if self.soft else coefficients
+        """The light in the bake's columns as its highlights reflect it, (columns, 3)."""
+        coefficients = self.basis.coefficients(self.light)
+        return self.basis.for_highlights(coefficients) if self.soft else coefficients
 
     @property
     def of_view(self) -> int:
@@ -216,11 +216,11 @@ def _trace(task: Measurement, number: int, members: NDArray[np.int64], incident_
     rays traced."""
     generator = np.random.Generator(np.random.PCG64(seed))
     highlight = task.surfaces.highlights[number]
-    window = task.surfaces.plan.parts[number].window[:task.order ** 2]
-    coefficients = task.reflected * window[:, None]
+    window = task.surfaces.plan.parts[number].window
+    coefficients = task.reflected if window is None else task.reflected * window[:task.basis.columns, None]
 
     def emission(directions: Array) -> Array:
-        banded = multiply(evaluate(task.order, directions), coefficients)
+        banded = task.basis.radiance(coefficients, directions)
         return np.stack([banded, task.light.radiance(directions)], axis=1)
 
     lights = task.light

@@ -7,7 +7,7 @@ afresh. Where another living process bakes the same job, the folder has a number
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
@@ -25,7 +25,10 @@ from ..storage.container import REBAKE, BakedTransfer, check_header, flatten_clo
 from ..storage.digests import digest_arrays, digest_json
 from ..storage.files import intact, load_arrays, save_arrays
 from ..storage.lamp_surfaces import read_lamp_surfaces
+from ..storage.subsurface_links import flatten_links, read_links
 from ..storage.texels import ENTRY as ATLAS_ENTRY
+from ..tracing.tracer import Tracer
+from ..transport.live_operator import LiveOperator
 from .claims import Claim
 from .recipe import BakeResult, Progress, bake
 from .settings import BakeSettings
@@ -37,6 +40,7 @@ _SCENE_ARRAYS = ("points", "normals", "triangles", "albedo", "loose", "material"
 _CONTAINER_ARRAYS = ("cluster", "weights", "bases", "albedo", "positions", "normals", "triangles")
 _CONTAINER_EXTRA = ("tangents", "source", "error")  # None where there are none
 _LAMP_ARRAYS = ("material", "kernels")  # of lamp_surfaces
+_LIVE_ARRAYS = ("counts", "indices", "values", "surfaces")  # of live
 
 
 def write_job(root: Path, scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None = None,
@@ -138,20 +142,24 @@ def _material(entry: dict[str, Any]) -> SurfaceMaterial:
                               for name, value in entry.items()})
 
 
-def run_job(folder: Path) -> Generator[Progress]:
-    """Bake a job, resuming after its finished stages, and leave the result in its folder."""
+def run_job(folder: Path, make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress]:
+    """Bake a job, resuming after its finished stages, and leave the result in its folder. make_tracer: see `bake`."""
     if intact(folder / RESULT_FILE) is not None:
         return
     scene, settings, light, digests, regions = read_job(folder)
-    result = yield from bake(scene, settings, folder, light, digests, regions)
+    result = yield from bake(scene, settings, folder, light, digests, regions, make_tracer)
     arrays = {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
               for name in _CONTAINER_ARRAYS + _CONTAINER_EXTRA if getattr(container, name) is not None}
     arrays |= {f"{index}_cloud": flatten_cloud(container.cloud) for index, container in enumerate(
         result.objects.values()) if container.cloud is not None}
     arrays |= {f"{index}_{name}": getattr(container, name) for index, container in enumerate(result.objects.values())
                for name in _LAMP_ARRAYS if container.lamp_surfaces is not None}
+    arrays |= {f"{index}_live_{name}": value for index, container in enumerate(result.objects.values())
+               if container.live is not None for name, value in container.live.arrays().items()}
     for index, container in enumerate(result.objects.values()):
         arrays |= {} if container.texels is None else _surface_arrays(f"{index}_texels_", container.texels)
+    arrays |= {f"{index}_links": flatten_links(container.links) for index, container in enumerate(
+        result.objects.values()) if container.links is not None}
     headers = [container.header for container in result.objects.values()]
     save_arrays(folder / RESULT_FILE, arrays, {"names": list(result.objects), "headers": headers,
                                                "report": result.report})
@@ -167,9 +175,13 @@ def read_result(folder: Path) -> BakeResult:
         cloud = read_cloud(check_header(header, name), arrays.get(f"{index}_cloud"), name)
         lamps = read_lamp_surfaces(header, *(arrays.get(f"{index}_{part}") for part in _LAMP_ARRAYS), len(parts[0]),
                                    name, REBAKE)
+        live = LiveOperator.of_arrays({part: arrays[f"{index}_live_{part}"] for part in _LIVE_ARRAYS}) \
+            if f"{index}_live_counts" in arrays else None
         atlas = header.get(ATLAS_ENTRY)
         texels = None if atlas is None else _surface(f"{index}_texels_", arrays, {k: atlas[k] for k in NUMBERS})
-        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps, texels=texels)
+        links = read_links(header, arrays.get(f"{index}_links"), len(parts[0]), name, REBAKE)
+        container = BakedTransfer(header, *parts, **extra, cloud=cloud, lamp_surfaces=lamps, live=live,
+                                  texels=texels, links=links)
         if not (np.isfinite(container.bases).all() and np.isfinite(container.weights).all()):
             raise StorageError(name, "the bake's result holds values that are not finite", "Please report this scene")
         objects[name] = container

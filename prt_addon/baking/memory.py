@@ -40,5 +40,9 @@ def memory_remedy(plan: Plan, settings: BakeSettings) -> str:
     if shiny:
         ways.append("fewer functions of highlights (glossy_rows)")
     if settings.distant_light:
-        ways += ["a lower order", "fewer gather_directions"]
+        if settings.distant_basis == "cubemap":
+            ways += ["fewer texels (cubemap_size)", "a smaller memory_budget"]
+        else:
+            ways.append("a lower order")
+        ways.append("fewer gather_directions")
     return f"Choose {', '.join(ways)}, or fewer objects"

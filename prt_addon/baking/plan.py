@@ -13,10 +13,13 @@ from ..scene.scene_mesh import SceneMesh
 from ..transport.column_arrays import COLUMNS_AT_ONCE
 from ..transport.incident_light import NUMBERS
 from ..transport.interreflection import SLOW_RATIO
+from ..transport.live_operator import BYTES_PER_ENTRY
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .distant_basis import array_budget, distant_basis
+from .sampling import dense_bytes, forecast_seconds, forecast_share, sampling_hints
 from .settings import EIGENTRANSPORT, BakeSettings
+from .sparse_choice import TYPICAL_SECONDS, note_sparse, sparse_left_out
 from .surface_transfer import MOST_ELEMENTS, NEAR_SURFACES, OUTSIDE
 from .surfaces import INCIDENT_ORDER, SurfacePlan, plan_surfaces
 
@@ -89,18 +92,20 @@ def make_plan(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | 
                    settings.fit_order_to_light, surfaces.coloured)
     needs.left_out += surfaces.left_out
     needs.hints += surfaces.hints
-    if basis.cubemap and not all(material.is_diffuse for material in scene.materials):
-        needs.hints.append("a cubemap's columns hold diffuse light only: highlights and light through bodies need"
-                           " distant_basis=sh")
+    needs.hints += sampling_hints(settings)
     columns = distant_basis(settings, needs.order).columns
+    if basis.cubemap and needs.shadow_rays and settings.sampling == "automatic":
+        rays_each = basis.samples(settings.directions) ** 2
+        note_sparse(needs, sparse_left_out(receivers, columns, TYPICAL_SECONDS * rays_each))
     values = receivers * columns * needs.channels
     glossy, translucent = int(surfaces.glossy_points(scene).sum()), int(surfaces.translucent_points(scene).sum())
     seconds, rays = {"prepare": 0.2 + 1e-6 * len(scene.triangles)}, {}
     if needs.bounces:
         rays["gather"] = gather
         seconds["gather"] = gather / GATHER_RAYS_PER_SECOND
-    rays["direct"] = shadow if needs.shadow_rays else 0
+    rays["direct"] = int(shadow * forecast_share(settings, glossy > 0)) if needs.shadow_rays else 0
     seconds["direct"] = rays["direct"] / SHADOW_RAYS_PER_SECOND + 1e-8 * values
+    seconds["direct"] += forecast_seconds(settings, receivers, columns, glossy > 0)
     if needs.bounces:
         seconds["interreflection"] = values * settings.gather_directions * 0.02 * SECONDS_PER_BOUNCED_VALUE + 0.05
     if glossy and settings.distant_light:
@@ -170,6 +175,8 @@ def _shapes(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
 def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan) -> int:
     """Bytes in the .blend file: cluster, weights and colour of each receiver, and the bases."""
     per_receiver = 4 * (1 + 4 * -(-settings.vectors // 4) + 4)
+    if settings.live_editing:
+        per_receiver += BYTES_PER_ENTRY * settings.live_entries
     return sum(count * per_receiver
                + 4 * most_clusters(settings, count, shape) * (settings.vectors + 1) * math.prod(shape)
                for count, shape in _shapes(scene, settings, needs, surfaces))
@@ -188,22 +195,26 @@ def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
         solved = transfer * min(1.0, COLUMNS_AT_ONCE / basis.columns)
         transfer = min(transfer, array_budget(settings) or transfer)
         solved += transfer / COPIES_OF_SERIES
-    rows = 4 * glossy * len(surfaces.functions) * needs.order ** 2 * needs.channels
+    rows = on_disk = 4 * glossy * len(surfaces.functions) * basis.columns * needs.channels
     visibility = 4 * glossy * ((INCIDENT_ORDER + needs.order - 1) ** 2 + INCIDENT_ORDER ** 2)
+    if basis.cubemap:  # a byte for each direction, and rows on disk beyond the budget
+        visibility = glossy * (2 * basis.rays(settings.directions) + 4 * INCIDENT_ORDER ** 2)
+        rows = min(rows, array_budget(settings) or rows)
     known = operator + kept + visibility
     # A series of bounces is slow only where surfaces send back more than its ratio.
     slow = float(surfaces.bounce_albedo(scene).max(initial=0.0)) > SLOW_RATIO
     copies, second = (COPIES_OF_KRYLOV, 1.5 * operator) if slow else (COPIES_OF_SERIES, 0.5 * operator)
     if not settings.distant_light:
-        rows = 0
+        rows = on_disk = 0
     local = _local_memory(settings, needs, receivers, glossy, len(surfaces.functions), share)
     shapes = _shapes(scene, settings, needs, surfaces, share)
-    stages = [known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
+    stages = [known + transfer + dense_bytes(settings, receivers, basis.columns),
+              known + min(receivers, BLOCK) * hits_each * BYTES_PER_SORTED_HIT,
               known + second + copies * solved,
               known + transfer + 2 * rows,  # twice: light between glossy surfaces goes once more
               known + transfer + rows + local.kept + max(local.zone, second + local.solving),
               _encoding(settings, shapes, rows + local.kept, transfer)]
-    disk = operator + kept + visibility + 2 * whole + rows + local.kept + local.responses
+    disk = operator + kept + visibility + 2 * whole + 2 * on_disk + local.kept + local.responses
     loose = LOOSE_LOCAL if settings.local_light else 1.0
     return int(PROCESS_BYTES + BYTES_PER_TRIANGLE * len(scene.triangles) + loose * max(stages)), int(disk)
 

@@ -75,7 +75,7 @@ class BakeProcess:
 
     def start(self) -> None:
         """Start the child. PRTError when Python itself can't be started."""
-        command = [*self.python_command, str(WORKER), str(self.job), "--site", _wheels_folder()]
+        command = [*self.python_command, str(WORKER), str(self.job), "--site", wheels_folder()]
         try:
             with open(self.job / MESSAGE_FILE, "wb") as messages, open(self.job / ERROR_FILE, "wb") as errors:
                 self._start(command, messages, errors)
@@ -201,7 +201,7 @@ def error_message(error: PRTError) -> Message:
             "exit_code": error.exit_code}
 
 
-def _wheels_folder() -> str:
+def wheels_folder() -> str:
     """Where the extension's wheels lie: an isolated Python does not look there by itself."""
     return str(Path(scipy.__file__).resolve().parents[1])
 

@@ -8,7 +8,7 @@ later run of the same job starts after the last one.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
 from dataclasses import dataclass, field, fields, replace
@@ -23,6 +23,7 @@ from ..basis.directions import quadrature
 from ..compression.coherence import Coherence, make_coherent
 from ..compression.eigentransport import eigentransport
 from ..compression.encoding import Encoding, encode
+from ..compression.global_frame import rows_at_once
 from ..compression.groups import encode_groups
 from ..compression.point_errors import point_errors
 from ..compression.settings import EncoderSettings
@@ -47,6 +48,8 @@ from ..transport.hit_record import HitRecord
 from ..transport.incident_light import DiffuseRadiance, GlossyRadiance, IndirectLight, SumOfRadiances
 from ..transport.interreflection import Interreflection, interreflect, limited_albedo
 from ..transport.receiver_set import ReceiverSet
+from ..transport.texel_visibility import TexelVisibility
+from .basis_choice import BasisChoice, choose_basis
 from .cubemap import bounced_cubemap, by_point, cubemap_signal, direct_cubemap, is_kept, without_scale
 from .distant_basis import distant_basis
 from .error_budget import BakedSample, choose_receivers, error_budget
@@ -54,6 +57,8 @@ from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
 from .lit_highlights import LitHighlights
+from .live_editing import kept_factors, with_live_editing
+from .live_links import with_subsurface_links
 from .local_budget import local_budget
 from .local_highlight_budget import local_highlight_budget
 from .local_lights import LocalTransfer, local_transfer, packed_local, unpacked_local
@@ -68,8 +73,18 @@ from .results import (
     surface_checks,
     white_world_checks,
 )
+from .sampling import SampledDirect, can_start_dense, dense_points, encode_from_dense, sampling_checks
 from .settings import EIGENTRANSPORT, BakeSettings
+from .sparse_choice import note_sparse
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
+from .texel_highlights import (
+    columns_through_bodies,
+    receiver_array,
+    sent_by_surfaces,
+    texel_rows,
+    texel_signal,
+    texel_visibility,
+)
 from .translucency import BodyLight, light_through_bodies, packed_bodies, unpacked_bodies
 
 POLL_SECONDS = 0.05
@@ -80,8 +95,6 @@ DIRECTIONS_OF_CHECKS = 256
 LEAST_DIFFUSE = 0.05
 # Share of glossy surfaces among what glossy receivers see from which on their light is followed by its direction.
 LEAST_GLOSSY_HITS = 0.01
-# Receivers whose rows are copied at once.
-ROWS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
@@ -107,25 +120,28 @@ Steps = Generator[Progress, None, Any]
 
 def bake(scene: SceneMesh, settings: BakeSettings, job_folder: Path | None = None,
          light: ReferenceLight | None = None, digests: dict[str, str] | None = None,
-         regions: NDArray[np.float64] | None = None) -> Generator[Progress, None, BakeResult]:
+         regions: NDArray[np.float64] | None = None,
+         make_tracer: Callable[..., Tracer] = Tracer) -> Generator[Progress, None, BakeResult]:
     """Yield progress and return the result.
 
     light: the scene's light, for the error budget (None: a stand-in sky). digests: of geometry by object name, kept
     in the headers. regions: (b, 4, 4) boxes in which local lights will move, cubes [-1, 1]^3 transformed (None: the
-    scene's free space). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
+    scene's free space). make_tracer: of points, triangles, a number of threads and the surface of texels (None:
+    none). Raises PRTError for what a user can mend; leaves only whole files in job_folder.
     """
+    settings, choice = choose_basis(scene, settings, light)
     settings = transport_settings(settings)
     regions = np.empty((0, 4, 4)) if regions is None else regions
-    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions).run())
+    return (yield from _Bake(scene, settings, job_folder, light, digests or {}, regions, choice, make_tracer).run())
 
 
 def transport_settings(settings: BakeSettings) -> BakeSettings:
     """What the stages of distant light are asked for where only local light is baked: a white sky of one coefficient
-    still tells what is buried, dark, or brighter than it can be. A cubemap's columns hold diffuse light only."""
+    still tells what is buried, dark, or brighter than it can be. A cubemap's columns know no order."""
     if not settings.distant_light:
         return replace(settings, order=1, subsurface=False)
     if settings.distant_basis == "cubemap":
-        return replace(settings, order=1, glossy_rows=0, subsurface=False)
+        return replace(settings, order=1)
     return settings
 
 
@@ -139,11 +155,15 @@ class _Bake:
     light: ReferenceLight | None
     digests: dict[str, str]
     regions: NDArray[np.float64]
+    choice: BasisChoice | None = None
+    make_tracer: Callable[..., Tracer] = Tracer
     resumed: list[str] = field(default_factory=list)
     shapes: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     coherence: dict[str, Coherence] = field(default_factory=dict)
     point_errors: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     cluster_zone: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    dense: NDArray[np.bool_] | None = None
+    sampling: dict[str, Any] = field(default_factory=dict)
     buried: NDArray[np.int64] | None = None
     local: LocalTransfer | None = None
     local_scale: float = 1.0
@@ -180,6 +200,7 @@ class _Bake:
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
+        self.kept_factors = kept_factors(gathered, self.albedo, transfer, self.basis, self.settings)
         glossy, subsurface = None, []
         if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
@@ -280,7 +301,7 @@ class _Bake:
 
     def _prepare(self) -> None:
         settings = self.settings
-        self.tracer = Tracer.of_scene(self.scene, settings.threads)
+        self.tracer = self.make_tracer(*self.scene.shape, settings.threads, self.scene.traced)
         self.gather_directions = quadrature(settings.gather_directions, 4)
         self.surfaces = self.plan.surfaces
         self.albedo = limited_albedo(self.surfaces.bounce_albedo(self.scene))
@@ -324,27 +345,43 @@ class _Bake:
         stored = self._load("direct")
         if stored is not None:
             found = stored[0]
+            if self.basis.cubemap:
+                self._sampled(receivers, SampledDirect.unpacked(*stored))
             visibility = VisibilityCoefficients(found["rows"], found["visible"], found.get("blocked")) \
                 if "rows" in found else None
             return receivers, found["transfer"], visibility
-        if self.basis.cubemap:
-            transfer = yield from self._follow("direct", direct_cubemap(
-                self.tracer, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.folder))
-            if is_kept(transfer, self.settings):
-                self._save("direct", {"transfer": transfer})
-            return receivers, transfer, None
         plain = None
-        if self.glossy.any():
-            front = receivers.key < len(self.scene.points)
-            chosen = front & self.glossy[receivers.key % len(self.scene.points)]
+        front = receivers.key < len(self.scene.points)
+        chosen = front & self.glossy[receivers.key % len(self.scene.points)]
+        if self.basis.cubemap:
+            plain = texel_visibility(chosen, self.basis, self.settings, gathered is not None)
+            sampled = yield from self._follow("direct", direct_cubemap(
+                self.tracer, self.scene, receivers, self.basis, self.settings, self.plan.needs.shadow_rays, self.light,
+                self.folder, plain))
+            transfer = self._sampled(receivers, sampled)
+            return receivers, transfer, self._visibility(receivers, transfer, plain, *sampled.kept())
+        if chosen.any():
             plain = HemisphereVisibility(chosen, INCIDENT_ORDER + order - 1, INCIDENT_ORDER if gathered else 0)
         transfer = yield from self._follow("direct", direct_transfer(
             self.tracer, receivers, *self.directions, order, self.settings.rotation_group, self.settings.seed,
             self.plan.needs.shadow_rays, plain))
+        return receivers, transfer, self._visibility(receivers, transfer, plain)
+
+    def _visibility(self, receivers: ReceiverSet, transfer: NDArray[np.float32],
+                    plain: HemisphereVisibility | TexelVisibility | None, arrays: dict[str, NDArray] | None = None,
+                    header: dict[str, Any] | None = None) -> VisibilityCoefficients | None:
+        """What was collected for highlights, once the stage is kept."""
         visibility = plain.result(receivers.normals) if plain else None
         extra = {name: value for name, value in vars(visibility).items() if value is not None} if visibility else {}
-        self._save("direct", {"transfer": transfer, **extra})
-        return receivers, transfer, visibility
+        if is_kept(transfer, self.settings) or not self.basis.cubemap:
+            self._save("direct", {"transfer": transfer, **extra, **(arrays or {})}, header)
+        return visibility
+
+    def _sampled(self, receivers: ReceiverSet, found: SampledDirect) -> NDArray[np.float32]:
+        """Keep what the report tells of how direct light was sampled, and which points the encoder starts from."""
+        self.dense, self.sampling = dense_points(self.scene, receivers, found.dense), found.facts
+        note_sparse(self.plan.needs, found.left_out)
+        return found.transfer
 
     def _glossy(self, receivers: ReceiverSet, transfer: NDArray[np.float32], visibility: VisibilityCoefficients,
                 gathered: Gather | None) -> Generator[Progress, None, GlossyRows]:
@@ -361,24 +398,33 @@ class _Bake:
         if stored is not None:
             return GlossyRows(points, stored[0]["rows"])
         surfaces = self._glossy_surfaces(points)
-        frames, order = surfaces.frames, self.plan.needs.order
+        frames = surfaces.frames
         indirect = self._indirect(gathered, receivers, transfer, visibility, self.albedo, None)
         first_round = 0.3 if self.glossy_bounce else 1.0
-        found = yield from self._follow("glossy", glossy_transfer(
-            self.tracer, surfaces, order, visibility.visible, indirect), 0.0, first_round)
+        found = yield from self._follow("glossy", self._rows(surfaces, receivers, visibility, indirect), 0.0,
+                                        first_round)
         if self.glossy_bounce:
             # Once more, with what was just found as the light that glossy surfaces send to each other.
             bounce = GlossyRadiance(gathered.hits, scene, points, frames, found, self.surfaces.functions)
             albedo = self.surfaces.diffuse_albedo(scene)
             indirect = self._indirect(gathered, receivers, transfer, visibility, albedo, bounce)
-            found = yield from self._follow("glossy", glossy_transfer(
-                self.tracer, surfaces, order, visibility.visible, indirect), first_round, 1.0)
-        windows = np.array([self.surfaces.parts[number].window[:found.shape[2]]
-                            for number in np.unique(scene.material[points])], np.float32)
-        if (windows < 1.0).any():
-            found *= windows[surfaces.material][:, None, :, None]
-        self._save("glossy", {"rows": found})
+            found = yield from self._follow("glossy", self._rows(surfaces, receivers, visibility, indirect),
+                                            first_round, 1.0)
+        for place, number in enumerate(np.unique(scene.material[points])):
+            window = self.surfaces.parts[number].window
+            if window is not None:
+                found[surfaces.material == place] *= window[:found.shape[2], None].astype(np.float32)
+        if is_kept(found, self.settings) or not self.basis.cubemap:
+            self._save("glossy", {"rows": found})
         return GlossyRows(points, found)
+
+    def _rows(self, surfaces: GlossySurfaces, receivers: ReceiverSet, visibility: VisibilityCoefficients,
+              indirect: IndirectLight | None) -> Generator[float, None, NDArray[np.float32]]:
+        """Fill the rows of highlights, in the columns of distant light."""
+        if self.basis.cubemap:
+            return texel_rows(self.tracer, surfaces, visibility, receivers, self.basis, self.settings, indirect,
+                              self.folder)
+        return glossy_transfer(self.tracer, surfaces, self.plan.needs.order, visibility.visible, indirect)
 
     def _glossy_surfaces(self, points: NDArray[np.int64]) -> GlossySurfaces:
         """What reflects at these points."""
@@ -398,7 +444,9 @@ class _Bake:
             return None
         channels = transfer.shape[2] if bounce is None else self.plan.needs.channels
         albedo = albedo[receivers.key % len(self.scene.points)][:, None, :channels]
-        source = DiffuseRadiance(gathered.hits, self.scene, receivers, albedo * transfer)
+        sent = sent_by_surfaces(albedo, transfer, self.settings, self.folder) if self.basis.cubemap \
+            else albedo * transfer
+        source = DiffuseRadiance(gathered.hits, self.scene, receivers, sent)
         return IndirectLight(gathered.hits, source if bounce is None else SumOfRadiances((source, bounce)),
                              visibility.rows, visibility.blocked)
 
@@ -413,8 +461,10 @@ class _Bake:
         if stored is not None:
             return unpacked_bodies(*stored)
         bodies = yield from self._follow("subsurface", light_through_bodies(
-            self.scene, self.surfaces, self.translucent, transfer, self.tracer.threads, self.settings.seed))
-        self._save("subsurface", *packed_bodies(bodies))
+            self.scene, self.surfaces, self.translucent, transfer, self.tracer.threads, self.settings.seed,
+            columns_through_bodies(int(self.translucent.sum()), self.basis, self.settings)))
+        if not self.basis.cubemap or all(is_kept(body.transfer, self.settings) for body in bodies):
+            self._save("subsurface", *packed_bodies(bodies))
         return bodies
 
     def _local(self, gathered: Gather | None, visibility: VisibilityCoefficients | None,
@@ -453,7 +503,9 @@ class _Bake:
         for target in self.targets:
             before = signals[target.name]
             columns = before.shape[2] if self.settings.distant_light else 0
-            joined = np.zeros((*before.shape[:2], columns + local.transfer.shape[1], before.shape[3]), np.float32)
+            shape = (*before.shape[:2], columns + local.transfer.shape[1], before.shape[3])
+            joined = receiver_array(shape, self.settings, self.folder) if self.basis.cubemap \
+                else np.zeros(shape, np.float32)
             joined[:, :, :columns] = before[:, :, :columns]
             self._write_local(joined[:, :, columns:], target, local)
             signals[target.name] = joined
@@ -483,21 +535,31 @@ class _Bake:
         share = np.array([part.diffuse_share for part in self.surfaces.parts], np.float32)
         signals = {}
         for target in self.targets:
-            functions = self.surfaces.functions_of_object(scene, target)
-            material, diffuse = scene.material[target.points], transfer[target.points]
-            if self.basis.cubemap:
-                signals[target.name] = cubemap_signal(diffuse, share[material], channels, self.basis, self.settings,
-                                                      self.folder)
-                continue
-            signal = np.zeros((len(diffuse), 1 + len(functions), diffuse.shape[1], channels), np.float32)
-            signal[:, 0] = diffuse * share[material, None, None]
-            if glossy is not None and len(functions) == glossy.rows.shape[1]:
-                glossy.write(signal[:, 1:], target.points)
-                self._add_dimming(signal, material, diffuse, scene.albedo[target.points])
-            for entry in subsurface:
-                if entry.target == target.name:
-                    signal[entry.points, 1] += entry.transfer / np.float32(CONSTANT)
-            signals[target.name] = signal
+            rows, points = 1 + len(self.surfaces.functions_of_object(scene, target)), target.points
+            bodies = [entry for entry in subsurface if entry.target == target.name]
+
+            def write(signal: NDArray[np.float32], part: slice, first: int = points.start,
+                      bodies: list[BodyLight] = bodies) -> None:
+                place = slice(first + part.start, first + part.stop)
+                material, diffuse = scene.material[place], transfer[place]
+                signal[:, 0] = diffuse * share[material, None, None]
+                if glossy is not None and signal.shape[1] == 1 + glossy.rows.shape[1]:
+                    glossy.write(signal[:, 1:], place)
+                    self._add_dimming(signal, material, diffuse, scene.albedo[place])
+                for entry in bodies:
+                    inside = (entry.points >= part.start) & (entry.points < part.stop)
+                    signal[entry.points[inside] - part.start, 1] += entry.transfer[inside] / np.float32(CONSTANT)
+
+            count = points.stop - points.start
+            shape = (count, rows, transfer.shape[1], channels)
+            if not self.basis.cubemap:
+                signals[target.name] = np.zeros(shape, np.float32)
+                write(signals[target.name], slice(0, count))
+            elif rows > 1:
+                signals[target.name] = texel_signal(shape, self.basis, self.settings, self.folder, write)
+            else:
+                signals[target.name] = cubemap_signal(transfer[points], share[scene.material[points]], channels,
+                                                      self.basis, self.settings, self.folder)
         return signals
 
     def _add_dimming(self, signal: NDArray[np.float32], material: NDArray[np.int32], diffuse: NDArray[np.float32],
@@ -573,6 +635,8 @@ class _Bake:
             before = np.concatenate([signals[t.name][keys[(keys >= t.points.start) & (keys < t.points.stop)]
                                                      - t.points.start, 1:, :columns] for t in self.targets
                                      if signals[t.name].shape[1] == 1 + functions])
+            scale = self.basis.scale()
+            before = before if scale is None else before / scale[:, None]
             self.highlights = keys, glossy.at(keys), before
 
     def _choose_local_highlights(self, local: LocalTransfer | None, signals: dict[str, NDArray[np.float32]]) -> None:
@@ -622,6 +686,10 @@ class _Bake:
         if self.local is None and self.settings.encoder == EIGENTRANSPORT and metric is None:
             encoding = eigentransport(signal, settings.vectors, target_error=settings.target_error,
                                       seed=settings.seed, progress=state.report).encoding
+        elif self.local is None and self.dense is not None and metric is None and can_start_dense(
+                dense := self.dense[target.points][~self.scene.loose[target.points]], settings.method):
+            positions = self.scene.points[target.points][~self.scene.loose[target.points]]
+            encoding = encode_from_dense(signal, dense, positions, settings, state.report)
         elif self.local is None:
             encoding = encode(signal, settings, metric, state.report)
         else:
@@ -676,7 +744,7 @@ class _Bake:
         surfaces = TrueSurfaces.of(self.tracer, self.scene, self.surfaces, self.albedo)
         sample = HighlightSample(keys, rows, compressed, self.surfaces.functions, *self._objects_of(keys))
         return (yield from self._follow("errors", highlight_budget(
-            surfaces, sample, self.light or stand_in_light(), self.plan.needs.order, settings.bounces,
+            surfaces, sample, self.light or stand_in_light(), self.basis, settings.bounces,
             int(self.glossy_bounce), settings.error_paths, settings.seed, settings.glossy_window), 0.5, 1.0))
 
     def _local_errors(self, encodings: dict[str, Encoding]) -> Generator[Progress, None, dict[str, Any]]:
@@ -738,12 +806,15 @@ class _Bake:
                 bodies: list[BodyLight]) -> BakeResult:
         """errors: the budget of diffuse light and that of highlights."""
         stability = stability_of(self.scene, transfer, self.keys, gathered, bounced, self.settings, self.basis)
-        stability += surface_checks(self.surfaces, bodies)
+        stability += surface_checks(self.surfaces, bodies) + sampling_checks(self.sampling)
         if self.settings.distant_light:
             stability += white_world_checks(self._white_worlds(encodings))
         report = report_of(self.scene, self.settings, self.plan, self.timer, encodings, self.coherence, *errors,
                            stability, gathered, bounced, self.light, self.resumed,
                            time.perf_counter() - self.started)
+        report["basis"] = self.basis.words if self.settings.distant_light else ""
+        report["choice"] = None if self.choice is None else self.choice.facts
+        report["tracer"] = self.tracer.facts
         if self.local is not None:
             report["local"] = self.local.facts
             report["local_errors"] = self.local_errors
@@ -754,6 +825,7 @@ class _Bake:
             if self.local_errors:
                 report["covers"] += lamps_covered(self.local_highlight_errors)
             report["scene"]["warnings"] += self.local.facts["warnings"]
+        report["sampling"] = self.sampling
         if self.memory_warning:
             report["scene"]["warnings"].append(f"Bake: {self.memory_warning}")
         if self.filled:
@@ -771,6 +843,12 @@ class _Bake:
         if self.local is not None:
             objects = {target.name: with_lamp_surfaces(objects[target.name], self.scene, target, self.surfaces)
                        for target in self.targets}
+            objects = {target.name: with_subsurface_links(objects[target.name], self.scene, target,
+                                                          self.settings.subsurface_links, self.tracer.threads)
+                       for target in self.targets}
+        objects, told = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces, self.albedo,
+                                          self.buried)
+        report |= told
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:
@@ -781,7 +859,7 @@ class _Bake:
             if len(functions) > 1:
                 solid = ~self.scene.loose[target.points]
                 found[target.name] = white_world(encodings[target.name], self.shapes[target.name], functions,
-                                                 self.scene.albedo[target.points][solid])
+                                                 self.scene.albedo[target.points][solid], self.basis.white_light())
         return found
 
     def _local_columns(self, name: str) -> LocalColumns | None:
@@ -794,8 +872,9 @@ class _Bake:
 def _energy(signal: NDArray[np.float32], metric: NDArray[np.float64] | None) -> float:
     """Sum of squares of a signal (p, rows, columns, channels), in the metric of its rows."""
     total = 0.0
-    for start in range(0, len(signal), ROWS_AT_ONCE):
-        block = signal[start:start + ROWS_AT_ONCE]
+    at_once = rows_at_once(signal[:1].size)
+    for start in range(0, len(signal), at_once):
+        block = signal[start:start + at_once]
         if metric is None:
             total += float(np.sum(np.square(block, dtype=np.float64)))
         else:
@@ -817,8 +896,9 @@ class GlossyRows:
         One channel serves all three.
         """
         inside = np.flatnonzero((self.points >= place.start) & (self.points < place.stop))
-        for start in range(0, len(inside), ROWS_AT_ONCE):
-            block = inside[start:start + ROWS_AT_ONCE]
+        at_once = rows_at_once(self.rows[:1].size)
+        for start in range(0, len(inside), at_once):
+            block = inside[start:start + at_once]
             signal[self.points[block] - place.start] = self.rows[block]
 
     def at(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -18,9 +18,11 @@ LIGHTINGS = ("environment", "local", "environment,local")
 LAMP_BASES = ("surfaces", "cloud")
 MERGED_RESPONSES = ("arithmetic", "harmonic", "solution")
 MOST_CLOUD_LIGHTS = 4096
-DISTANT_BASES = ("sh", "cubemap")
+SAMPLINGS = ("automatic", "every", "sparse")
+AUTO = "auto"
+DISTANT_BASES = ("sh", "cubemap", AUTO)
 EIGENTRANSPORT = "eigentransport"
-ENCODERS = (*METHODS, EIGENTRANSPORT)
+ENCODERS = (*METHODS, EIGENTRANSPORT, AUTO)
 # Vectors of a cluster: more than this only where there is but one cluster.
 MOST_CLUSTER_VECTORS = 24
 
@@ -36,7 +38,8 @@ class BakeSettings:
     bounce_error: relative energy that may be left out of the bounces.
     clusters, vectors: most clusters, and vectors per cluster, of the encoding (fewer where the signal needs fewer).
     encoder: "static", "iterative" or "adaptive" (Sloan 2003, 4.1-4.3), or "eigentransport" (Nowrouzezahrai 2007): one
-        cluster for all receivers, with up to 192 vectors.
+        cluster for all receivers, with up to 192 vectors. "auto": clusters or eigentransport, whichever keeps a
+        cubemap's light_error for less (basis_choice.py); clusters for harmonics.
     compression_error: relative RMS error of the encoding at which it stops; 0 uses all clusters and vectors.
     coherence: share of the squared error that may be added to the encoding so that fewer triangles lie in more than one
         cluster (Sloan 2003, section 5; the paper spent 0.05 to 0.1). 0 = off, because drawing does not need it: each
@@ -53,11 +56,22 @@ class BakeSettings:
         diffuse light is drawn, metals are black. Each row costs as much as the whole diffuse transfer.
     glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
         most); below, its light stays in the diffuse layer.
-    glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
+    glossy_window: whether highlights sharper than the light's order (with a cubemap, than their rows) reflect a softer
+        light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
+    subsurface_links: links that each receiver of a translucent material keeps for the light of lamps, so that it
+        travels through the body as they move; 64 serve, 0 = none. 16 bytes each, in the file and on the graphics card.
     distant_basis: what World and Suns are baked in. "sh": spherical harmonics of `order`. "cubemap": the texels of a
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
-        harmonics blur them. Costs memory and time with the texels' number; diffuse light only.
+        harmonics blur them. Costs memory and time with the texels' number, highlights with that of their rows too.
+        "auto": the order, or the cubemap, that keeps light_error under the scene's present light for least
+        (basis_choice.py); a million rays find out. A later light that is sharper is shown blurred.
+    light_error: relative RMS of shadowed irradiance that may be lost, with what an automatic choice can't hold of the
+        light. Order 5 loses 2 to 5 % under most HDRIs, 10 to 30 % under a hard sun.
+    sampling: which elements of a cubemap's direct light are traced. "every": all. "sparse": about an eighth of them,
+        from which the rest is woven (Huang 2010): up to twice as fast for detailed meshes, slower for simple ones, with
+        an error of about 1 %, which is measured; not with highlights. "automatic": sparse only where that is surely
+        faster and its error no more than compression_error.
     memory_budget: GB of transfer kept in memory while a cubemap is baked; what is more goes to a file; 0 = no limit.
     fit_order_to_light: lower the order to what the scene's present light carries.
     lighting: "environment" (World and Suns), "local" (lamps that move within a light cloud), or both with a comma.
@@ -81,6 +95,9 @@ class BakeSettings:
     merged_response: "arithmetic" = the mean of the merged lights' responses: what a response that is linear in position
         would be at their mean place; "harmonic" = as published (4.1), which is darker; "solution" = a new solution at
         the merged place, which costs as much again as the cloud, once for every zone.
+    live_editing: whether the bake keeps its form factors, so that bounced light in the preview follows base colours and
+        emission that are edited later. Costs 8 bytes per receiver and entry.
+    live_entries: most form factors kept per receiver; fewer cost less data and time, and make edits less exact.
     threads: 0 = one per core. seed: of all random choices.
     """
 
@@ -105,8 +122,11 @@ class BakeSettings:
     glossy_albedo: float = 0.15
     glossy_window: bool = True
     subsurface: bool = True
+    subsurface_links: int = 0
     distant_basis: str = "sh"
+    light_error: float = 0.05
     cubemap_size: int = 16
+    sampling: str = "automatic"
     memory_budget: float = 2.0
     fit_order_to_light: bool = False
     lighting: str = "environment"
@@ -122,6 +142,8 @@ class BakeSettings:
     merge_distance: float = 0.5
     merge_response: float = 0.05
     merged_response: str = "arithmetic"
+    live_editing: bool = False
+    live_entries: int = 64
     threads: int = 0
     seed: int = 1
 
@@ -149,13 +171,14 @@ PRESETS: dict[str, BakeSettings] = {
     "draft": BakeSettings(order=4, directions=256, gather_directions=128, bounce_error=1e-2, clusters=64, vectors=6,
                           surface_patches=1024, surface_columns=128, cloud_lights=64, encoder="static",
                           compression_error=1e-2, spacing=1.0 / 32.0,
-                          error_receivers=32, error_paths=4096, glossy_rows=9, glossy_albedo=0.3),
+                          error_receivers=32, error_paths=4096, glossy_rows=9, glossy_albedo=0.3,
+                          light_error=0.1),
     "standard": BakeSettings(),
     "high": BakeSettings(order=7, directions=4096, gather_directions=1024, bounce_error=2e-4, clusters=1024, vectors=20,
                          surface_patches=4096, surface_columns=512, cloud_lights=512, merge_response=0.02,
                          encoder="adaptive", compression_error=5e-4,
                          spacing=1.0 / 128.0, error_receivers=128, error_paths=16384, glossy_rows=24,
-                         glossy_albedo=0.03),
+                         glossy_albedo=0.03, light_error=0.025),
 }
 
 # Inclusive limits of each number, and why there is a limit at all.
@@ -168,6 +191,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "clusters": (1, 4096, "the shader's cluster table"),
     "vectors": (0, MOST_VECTORS, "48 FLOAT4 attributes"),
     "cubemap_size": (2, 32, "6,144 columns"),
+    "light_error": (1e-3, 1.0, "the choice is measured at few receivers"),
     "memory_budget": (0.0, 1e6, "0 means no limit"),
     "compression_error": (0.0, 1.0, "it is relative"),
     "coherence": (0.0, 0.5, "the encoder's work would be undone"),
@@ -178,6 +202,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "error_paths": (64, 2 ** 20, "fewer say nothing"),
     "glossy_rows": (0, 25, "order 5 of the hemisphere"),
     "glossy_albedo": (0.0, 1.0, "it is a share of the light"),
+    "subsurface_links": (0, 256, "more than the sum over all receivers needs"),
     "surface_patches": (1, 2 ** 14, "each is one more solution"),
     "surface_columns": (1, 1024, "each is carried by every cluster"),
     "cloud_lights": (1, MOST_CLOUD_LIGHTS, "each is a global illumination solution"),
@@ -187,6 +212,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "zone_receivers": (0, 2 ** 31 - 1, "0 means one zone"),
     "merge_distance": (0.0, 1e6, "it is a fraction of the scene"),
     "merge_response": (0.0, 1e6, "it is a fraction of the brightest response"),
+    "live_entries": (8, 1024, "eight see too little, and few rows are longer"),
     "threads": (0, 1024, "0 means one per core"),
     "seed": (0, 2 ** 31 - 1, "a non-negative number"),
 }
@@ -238,7 +264,7 @@ def check(settings: BakeSettings) -> BakeSettings:
         raise BadArguments("setting glossy_rows", f"{settings.glossy_rows} is no set of functions of the hemisphere",
                            f"Use one of {', '.join(map(str, GLOSSY_ROWS))}")
     for name, words in (("lighting", LIGHTINGS), ("merged_response", MERGED_RESPONSES), ("lamp_basis", LAMP_BASES),
-                        ("distant_basis", DISTANT_BASES), ("receivers", RECEIVERS),
+                        ("distant_basis", DISTANT_BASES), ("sampling", SAMPLINGS), ("receivers", RECEIVERS),
                         ("atlas_charts", METHODS_OF_CHARTS)):
         if getattr(settings, name) not in words:
             raise BadArguments(f"setting {name}", f"{getattr(settings, name)!r} is unknown",

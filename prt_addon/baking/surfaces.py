@@ -26,6 +26,7 @@ from ..transport.brdf import (
     reflection_of_material,
     ringing_window,
 )
+from ..transport.kernel_window import softened
 from ..transport.lamp_kernel import lamp_kernel
 from .settings import BakeSettings
 
@@ -52,7 +53,7 @@ class SurfacePart:
     """How one material is held.
 
     kernel: (rows, incident functions, 1 or 3), None where it has no rows of its own; window: (columns,) factors on the
-    light that a highlight sharper than the light's order reflects; diffuse_share: of its diffuse
+    light that a highlight sharper than the light's order reflects, None where all are 1; diffuse_share: of its diffuse
     layer that the layers above leave, a mean over views; dimming: (rows,) how that differs over views; highlight:
     (3,) mean share of the light that its highlight returns; translucent: subsurface light is baked; subsurface_share:
     of it that leaves, what is no metal and what the highlight lets through; lamp_kernel: (rows, LAMP_ORDER^2, 1 or 3)
@@ -62,7 +63,7 @@ class SurfacePart:
 
     material: SurfaceMaterial
     kernel: NDArray[np.float64] | None
-    window: NDArray[np.float64]
+    window: NDArray[np.float64] | None
     diffuse_share: float
     dimming: NDArray[np.float64]
     highlight: NDArray[np.float64]
@@ -129,6 +130,11 @@ class SurfacePlan:
         return scene.albedo * share[scene.material, None] + highlight[scene.material]
 
 
+def is_harmonic(settings: BakeSettings) -> bool:
+    """Whether an order of spherical harmonics limits the light that is baked."""
+    return settings.distant_light and settings.distant_basis == "sh"
+
+
 def plan_surfaces(scene: SceneMesh, settings: BakeSettings) -> SurfacePlan:
     """What each material of the scene gets. Materials of casters that are not baked only need their bounced light."""
     used = {int(number) for target in scene.objects if target.is_target
@@ -162,8 +168,8 @@ def _rows(material: SurfaceMaterial, reflection: Reflection, settings: BakeSetti
         left_out.append(LeftOut(name, f"it returns {albedo:.1%} of the light, less than glossy_albedo",
                                 "view-dependent rows"))
         return 0
-    # Without distant light the order that limits is that of what receivers see of each other.
-    order = settings.order if settings.distant_light else INCIDENT_ORDER
+    # Without harmonics the order that limits is that of what receivers see.
+    order = settings.order if is_harmonic(settings) else INCIDENT_ORDER
     choice = choose_rows(material, order, settings.glossy_rows, reflection)
     if choice.kind == "glossy":
         hints.append(f"{name}: {choice.why}")
@@ -185,16 +191,23 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
     through = 1.0 - material.subsurface_weight if translucent else 1.0
     inside = material.subsurface_weight * (1.0 - material.metallic)
     if functions is None:
-        return SurfacePart(material, None, np.ones(1), through, np.zeros(1), highlight, translucent, inside)
+        return SurfacePart(material, None, None, through, np.zeros(1), highlight, translucent, inside)
     kernel = reflection_matrix(reflection, functions, np.arange(INCIDENT_ORDER ** 2), SMALLEST_INCIDENT)
+    if settings.glossy_window and settings.distant_light and not is_harmonic(settings):
+        kernel, kept = softened(kernel, functions)
+        if kept < 1.0:
+            hints.append(f"the highlight of material {material.name}: a sun would ring in its {len(functions)} rows; a"
+                         f" window leaves {kept:.0%} of the highest band (glossy_window=false keeps all)")
     if kernel.shape[2] == 3 and np.ptp(kernel, axis=2).max() <= _GREY * np.abs(kernel).max():
         kernel = kernel[:, :, :1]
     left = diffuse_left(material, functions)
-    bands = ringing_window(reflection, settings.order) if settings.glossy_window else np.ones(settings.order)
+    bands = np.ones(1)
+    if settings.glossy_window and is_harmonic(settings):
+        bands = ringing_window(reflection, settings.order)
     if bands[-1] < 1.0:
         hints.append(f"the highlight of material {material.name}: light of order {settings.order} would ring in it; a"
                      f" window leaves {bands[-1]:.0%} of the highest band (glossy_window=false keeps all)")
-    window = expand_bands(bands)
+    window = expand_bands(bands) if bands[-1] < 1.0 else None
     lamps = lamp_kernel(reflection, functions, settings.glossy_window) if settings.local_light else None
     if lamps is not None:
         lamps = lamps[:, :, :kernel.shape[2]]
@@ -228,12 +241,16 @@ class WhiteWorld:
     mean: float
 
 
-def white_world(encoding: Encoding, shape: tuple[int, int, int], functions: Indices,
-                albedo: NDArray[np.float32]) -> WhiteWorld:
+def white_world(encoding: Encoding, shape: tuple[int, int, int], functions: Indices, albedo: NDArray[np.float32],
+                white: NDArray[np.float64] | None = None) -> WhiteWorld:
     """What is drawn of an object in a white world. shape: (rows, columns, channels) of the signal; functions: of rows
-    1, 2, ... (none where it is diffuse); albedo: (p, 3) of the encoded points."""
+    1, 2, ... (none where it is diffuse); albedo: (p, 3) of the encoded points; white: (distant columns, 3) that world
+    in the columns (`DistantBasis.white_light`), None: spherical harmonics."""
     light = np.zeros((shape[1], 3))
-    light[0] = 1.0 / CONSTANT  # of the constant function, for radiance 1
+    if white is None:
+        light[0] = 1.0 / CONSTANT  # of the constant function, for radiance 1
+    else:
+        light[:len(white)] = white
     constants = cluster_constants(encoding.bases.reshape(*encoding.bases.shape[:2], *shape), light)
     rows = exit_radiance(encoding.cluster, encoding.weights, constants)
     smallest, largest, total, weight = np.inf, -np.inf, 0.0, 0.0

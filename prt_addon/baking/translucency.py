@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.scene_mesh import SceneMesh, SceneObject
+from ..transport.column_arrays import column_blocks
 from ..transport.dipole import Medium, total_reflectance
 from ..transport.subsurface import Subsurface, subsurface_transfer
 from .surfaces import SurfacePlan
@@ -35,11 +36,12 @@ class BodyLight:
 
 
 def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: NDArray[np.bool_],
-                         transfer: NDArray[np.float32], threads: int, seed: int,
+                         transfer: NDArray[np.float32], threads: int, seed: int, at_once: int = 0,
                          ) -> Generator[float, None, list[BodyLight]]:
     """Yield progress, return the light of every body.
 
-    translucent: (p,) points that show it; transfer: (p, columns, channels) unit-albedo irradiance transfer.
+    translucent: (p,) points that show it; transfer: (p, columns, channels) unit-albedo irradiance transfer. at_once:
+    columns that go through a body together, 0 for all; the links are found anew for each such block.
     """
     bodies = [(target, number) for target in scene.objects if target.is_target
               for number in np.unique(scene.material[target.points][translucent[target.points]])]
@@ -49,19 +51,32 @@ def light_through_bodies(scene: SceneMesh, surfaces: SurfacePlan, translucent: N
         points = np.flatnonzero(translucent[target.points] & (scene.material[target.points] == number))
         material = surfaces.parts[number].material
         medium = Medium.of_principled(material.base_colour, material.subsurface_radius)
-        steps = subsurface_transfer(scene.points[start + points], scene.normals[start + points],
-                                    point_areas(scene, target)[points], transfer[start + points], medium,
-                                    threads=threads, seed=seed)
-        try:
-            while True:
-                yield (index + next(steps)) / len(bodies)
-        except StopIteration as end:
-            light = end.value
+        where = start + points
+        body = scene.points[where], scene.normals[where], point_areas(scene, target)[points]
+        parts = list(column_blocks(transfer.shape[1], at_once or transfer.shape[1]))
+        found = []
+        for number_of_part, part in enumerate(parts):
+            block = np.ascontiguousarray(transfer[where, part])
+            steps = subsurface_transfer(*body, block, medium, threads=threads, seed=seed)
+            try:
+                while True:
+                    yield (index + (number_of_part + next(steps)) / len(parts)) / len(bodies)
+            except StopIteration as end:
+                found.append(end.value)
+        light = _joined(found)
         weight = np.float32(surfaces.parts[number].subsurface_share)
         numbers = replace(light, transfer=light.transfer[:0])
         result.append(BodyLight(target.name, points, material.name, numbers, light.transfer * weight,
                                 _lost(medium, light)))
     return result
+
+
+def _joined(parts: list[Subsurface]) -> Subsurface:
+    """Blocks of columns side by side, with the worst of their errors."""
+    if len(parts) == 1:
+        return parts[0]
+    worst = {name: max(getattr(part, name) for part in parts) for name in ("error", "worst", "bound")}
+    return replace(parts[0], transfer=np.concatenate([part.transfer for part in parts], axis=1), **worst)
 
 
 def _lost(medium: Medium, light: Subsurface) -> float:

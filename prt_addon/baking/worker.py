@@ -41,6 +41,11 @@ def load_package(folder: Path) -> ModuleType:
     return module
 
 
+def use_wheels(folder: str) -> None:
+    """Tell this Python where the extension's wheels lie."""
+    site.addsitedir(folder)
+
+
 def emit(message_type: str, **values: Any) -> None:
     """Write one message; the parent knows the closed set of types (process.MESSAGES)."""
     sys.stdout.write(json.dumps({"type": message_type, **values}) + "\n")
@@ -73,10 +78,11 @@ def be_polite() -> None:
         os.nice(NICENESS)
 
 
-def run_or_give_up(job_folder: Path, clean_up: Callable[[], None], cant_write: int) -> int:
+def run_or_give_up(job_folder: Path, clean_up: Callable[[], None], cant_write: int,
+                   package: str = PACKAGE_FOLDER.name, **options: Any) -> int:
     """`run`; where its messages can't be written (a full disk), end at once with the status that says so."""
     try:
-        return run(job_folder)
+        return run(job_folder, package, **options)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS):
             raise
@@ -84,13 +90,14 @@ def run_or_give_up(job_folder: Path, clean_up: Callable[[], None], cant_write: i
         os._exit(cant_write)  # without a flush of what can't be written
 
 
-def run(job_folder: Path) -> int:
-    """Bake the job, with its result left in the folder. Returns the exit status."""
-    errors = importlib.import_module(f"{PACKAGE_FOLDER.name}.errors")
+def run(job_folder: Path, package: str, **options: Any) -> int:
+    """Bake the job, with its result left in the folder. package: the name under which `prt_addon` is imported; options:
+    of `run_job`. Returns the exit status."""
+    errors = importlib.import_module(f"{package}.errors")
     try:
-        job = importlib.import_module(f"{PACKAGE_FOLDER.name}.baking.job")
+        job = importlib.import_module(f"{package}.baking.job")
         last_stage, last_time = None, 0.0
-        for progress in job.run_job(job_folder):
+        for progress in job.run_job(job_folder, **options):
             now = time.monotonic()
             if progress.stage != last_stage or now - last_time >= PROGRESS_SECONDS:
                 last_stage, last_time = progress.stage, now
@@ -112,7 +119,7 @@ def main() -> int:
     parser.add_argument("job", type=Path)
     parser.add_argument("--site", required=True)
     arguments = parser.parse_args()
-    site.addsitedir(arguments.site)
+    use_wheels(arguments.site)
     be_polite()
     load_package(PACKAGE_FOLDER)
     leftovers = importlib.import_module(f"{PACKAGE_FOLDER.name}.baking.leftovers")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..storage.container import HEADER_PROPERTY
 from ..storage.digests import digest_arrays, digest_json
 from .bake_set import UNKNOWN, pack_place
+from .followed import followed_digest
 from .materials import material_digest
 from .nodes import reachable
 from .visibility import render_visible_objects
@@ -25,6 +26,7 @@ BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.f
 
 
 RECEIVER_PROPERTY = "prt_receiver"
+FOLLOWED = "live_materials"  # the digest of what live editing does not follow
 RELIT_ATTRIBUTE = "PRT Light"  # the colour attribute of exit radiance that `prt.relight` writes
 
 
@@ -128,36 +130,54 @@ def used_materials(scene_object: bpy.types.Object) -> list[bpy.types.Material | 
     return [slot.material for slot in scene_object.material_slots]
 
 
-def fingerprint(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[str, str | None]:
-    """Digests of an object's geometry and materials, to take when it is read and to hand to `write_baked`."""
-    return {"geometry": geometry_digest(scene_object, depsgraph), "materials": materials_as_baked(scene_object)}
+def fingerprint(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
+                live: bool = False) -> dict[str, str | None]:
+    """Digests of an object's geometry and materials, to take when it is read and to hand to `write_baked`. live: also
+    of what live editing does not follow of its materials."""
+    digests = {"geometry": geometry_digest(scene_object, depsgraph), "materials": materials_as_baked(scene_object)}
+    if live and follows_edits(scene_object, depsgraph) and not shows_relit(scene_object):
+        digests[FOLLOWED] = followed_digest(used_materials(scene_object))
+    return digests
 
 
-def materials_as_baked(scene_object: bpy.types.Object) -> str:
-    """Digest of an object's materials; where they only show what its bake gave, of those that it was baked with."""
-    then = _materials_at_bake(scene_object) if shows_relit(scene_object) else None
+def follows_edits(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether live editing can tell the object's faces and their materials: it is one mesh of its own."""
+    evaluated = scene_object.evaluated_get(depsgraph)
+    return evaluated.is_evaluated and _instances_nothing(evaluated)
+
+
+def materials_as_baked(scene_object: bpy.types.Object, follow: bool = False) -> str:
+    """Digest of an object's materials; where they only show what its bake gave, of those that it was baked with.
+
+    follow: also where all that changed is what live editing follows.
+    """
+    then = _digest_at_bake(scene_object, "materials") if shows_relit(scene_object) else None
+    if then is None and follow:
+        fixed = _digest_at_bake(scene_object, FOLLOWED)
+        if fixed is not None and fixed == followed_digest(used_materials(scene_object)):
+            then = _digest_at_bake(scene_object, "materials")
     return then or material_digest(used_materials(scene_object))
 
 
-def _materials_at_bake(scene_object: bpy.types.Object) -> str | None:
-    """As its bake's header tells; None without a bake that can be read."""
+def _digest_at_bake(scene_object: bpy.types.Object, name: str) -> str | None:
+    """As its bake's header tells; None without a bake that can be read, or where it has none of that name."""
     for mesh in (scene_object.original.get(RECEIVER_PROPERTY), scene_object.original.data):
         header = mesh.get(HEADER_PROPERTY) if isinstance(mesh, bpy.types.Mesh) else None
         if header is not None:
             try:
-                return json.loads(header)["digests"]["materials"]
-            except (TypeError, ValueError, KeyError):
+                return json.loads(header)["digests"].get(name)
+            except (TypeError, ValueError, KeyError, AttributeError):
                 return None
     return None
 
 
-def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
+def surroundings(depsgraph: bpy.types.Depsgraph, follow: bool = False) -> dict[str, str]:
     """What each render-visible piece of geometry is and where it stands: all that can shadow or light another.
 
     By name of the object, or of instancer and instanced object: a digest of shape and materials, then the place
     (`bake_set.pack_place`), so that it can be told whether everything moved together. What only the viewport hides is
-    UNKNOWN: Blender does not evaluate it, and taking it for gone would be wrong. One pass over all meshes; call it once
-    for all baked objects, not per object and redraw.
+    UNKNOWN: Blender does not evaluate it, and taking it for gone would be wrong. follow: as for `materials_as_baked`.
+    One pass over all meshes; call it once for all baked objects, not per object and redraw.
     """
     visible = render_visible_objects(depsgraph.view_layer)
     shapes: dict[str, str] = {}
@@ -179,18 +199,18 @@ def surroundings(depsgraph: bpy.types.Depsgraph) -> dict[str, str]:
         name = owner.name_full if source.original == owner else f"{owner.name_full}/{source.original.name_full}"
         key = f"{name}/{mesh.name_full}" if instance.is_instance and source.original == owner else name
         if key not in places:
-            shapes[key] = _shape_digest(meshes[pointer], source, place)
+            shapes[key] = _shape_digest(meshes[pointer], source, place, follow)
         places.setdefault(key, []).append(place)
     hidden = {name: UNKNOWN for name, found in visible.items()
               if name not in reached and (found.type in SHAPES or found.instance_type != "NONE")}
     return hidden | {key: _with_place(shapes[key], found) for key, found in places.items()}
 
 
-def _shape_digest(mesh: str, source: bpy.types.Object, place: NDArray[np.float64]) -> str:
+def _shape_digest(mesh: str, source: bpy.types.Object, place: NDArray[np.float64], follow: bool) -> str:
     """Of a mesh with the materials of the object that shows it; with its size where that counts: light travels through
     bodies by a length of its own."""
     materials = used_materials(source)
-    parts = [mesh, materials_as_baked(source), source.visible_shadow, source.visible_diffuse]
+    parts = [mesh, materials_as_baked(source, follow), source.visible_shadow, source.visible_diffuse]
     if any(_is_translucent(node) for material in dict.fromkeys(materials) for node in _nodes_of(material)):
         volume = np.linalg.det(place[:3, :3])  # small
         parts.append(f"{abs(volume) ** (1.0 / 3.0):.4g}")

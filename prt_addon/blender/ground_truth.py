@@ -102,7 +102,7 @@ def start_render(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, names:
         request = {"scene": scene.name, "view_layer": view_layer.name, "objects": names, "size": list(size),
                    "samples": samples, "parts": parts, "seed": seed}
         (job / "request.json").write_text(json.dumps(request), "utf-8")
-        process = RenderProcess(_blender(), job)
+        process = RenderProcess(blender_command(), job)
         process.start()
         return process
     except (RuntimeError, OSError) as error:
@@ -126,7 +126,7 @@ def read_render(process: RenderProcess, samples: int) -> GroundTruth:
         raise StorageError("Compare", f"the render left no picture ({error})", "Compare again") from error
 
 
-def _blender() -> list[str]:
+def blender_command() -> list[str]:
     """What starts Blender once more, without a window and without anybody's preferences; a script's path follows."""
     if bpy.app.module:
         return [sys.executable]

@@ -105,16 +105,18 @@ def copy_groups(tree: bpy.types.NodeTree, change: Callable[[bpy.types.NodeTree],
             copy_groups(node.node_tree, change, copies)
 
 
-def signature(tree: bpy.types.NodeTree, edits: bool = True) -> Hashable:
+def signature(tree: bpy.types.NodeTree, edits: bool = True, without: frozenset[str] = frozenset()) -> Hashable:
     """Hashable value that changes when nodes, values, links, images (by file) or groups of the tree change; with edits
-    also when an image is painted on for the first time since it was saved."""
-    return tuple((tuple(_node_signature(node, edits) for node in part.nodes),
+    also when an image is painted on for the first time since it was saved. without: names of inputs whose values do not
+    count."""
+    return tuple((tuple(_node_signature(node, edits, without) for node in part.nodes),
                   tuple((link.from_node.name, link.from_socket.identifier, link.to_node.name,
                          link.to_socket.identifier, link.is_muted) for link in part.links)) for part in walk(tree))
 
 
-def _node_signature(node: bpy.types.Node, edits: bool) -> Hashable:
-    inputs = tuple(_value(s.default_value) for s in node.inputs if hasattr(s, "default_value"))
+def _node_signature(node: bpy.types.Node, edits: bool, without: frozenset[str]) -> Hashable:
+    inputs = tuple(_value(s.default_value) for s in node.inputs
+                   if hasattr(s, "default_value") and s.name not in without)
     outputs = tuple(_value(s.default_value) for s in node.outputs if hasattr(s, "default_value"))
     return node.bl_idname, node.name, inputs, outputs, _struct_signature(node, 0, edits)
 

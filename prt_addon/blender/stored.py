@@ -25,6 +25,7 @@ from ..scene.texel_surface import TexelSurface
 from ..storage import container
 from ..storage.container import BakedTransfer
 from ..storage.lamp_surfaces import ENTRY as LAMP_SURFACES
+from ..storage.subsurface_links import flatten_links
 from ..storage.texels import (
     ATLAS_PROPERTY,
     TEXEL_ATTRIBUTE,
@@ -36,6 +37,7 @@ from ..storage.texels import (
 from ..storage.texels import ENTRY as ATLAS
 from .bake_set import changed_piece
 from .fingerprint import RECEIVER_PROPERTY, fingerprint, geometry_digest, materials_as_baked, shows_relit
+from .live_materials import clear_live, write_live
 from .read_scene import is_flattened, normal_matrix, read_mesh, transform_rows
 
 NORMAL_ATTRIBUTE, TANGENT_ATTRIBUTE = "prt_normal", "prt_tangent"
@@ -117,8 +119,9 @@ def read_baked(scene_object: bpy.types.Object) -> BakedTransfer | None:
     if LAMP_SURFACES in header:
         material = _read_attribute(mesh, container.MATERIAL_ATTRIBUTE, 1, scene_object.name)
         kernels = _read_numbers(mesh, container.KERNELS_PROPERTY) if container.KERNELS_PROPERTY in mesh else None
+    links = _read_numbers(mesh, container.LINKS_PROPERTY) if container.LINKS_PROPERTY in mesh else None
     baked = container.unpack(header, cluster, weights, bases, geometry, scene_object.name, tangents, cloud, material,
-                             kernels)
+                             kernels, links)
     texels = _read_texels(mesh, header, triangles, scene_object.name)
     error = _read_optional(mesh, container.ERROR_ATTRIBUTE, "FLOAT", "POINT")
     source = _read_optional(mesh, container.SOURCE_ATTRIBUTE, "INT", "FACE")
@@ -185,13 +188,15 @@ def transform_since_bake(scene_object: bpy.types.Object, header: dict,
 
 
 def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
-          surroundings: dict[str, str] | None = None, matrix: NDArray[np.float64] | None = None) -> str | None:
+          surroundings: dict[str, str] | None = None, matrix: NDArray[np.float64] | None = None,
+          follow: bool = False) -> str | None:
     """Why an object's bake no longer fits the scene, as a clause for the user; None while it does or without a bake.
 
     A bake fits as long as everything keeps its place relative to everything else (`transform_since_bake` tells where it
     went). surroundings: of now, from `fingerprint.surroundings`, if what else moved shall count too; without them a
-    move of the object alone makes it stale. matrix: as for `transform_since_bake`. Raises StorageError where the header
-    can't be read.
+    move of the object alone makes it stale. matrix: as for `transform_since_bake`. follow: edits of materials that live
+    editing follows count as none, for whoever shows what it finds (surroundings then likewise). Raises StorageError
+    where the header can't be read.
     """
     header = stored_header(scene_object)
     if header is None:
@@ -202,7 +207,7 @@ def stale(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     geometry = [geometry_digest(scene_object, depsgraph, shown) for shown in images]
     if geometry[0] is not None and digests.get("geometry") not in geometry:
         return "its mesh or modifiers changed since the bake"
-    if digests.get("materials") != materials_as_baked(scene_object):
+    if digests.get("materials") != materials_as_baked(scene_object, follow):
         return "its materials changed since the bake"
     moved, then = transform_since_bake(scene_object, header, matrix), digests.get("surroundings")
     stays = np.array_equal(moved, np.eye(4))
@@ -279,7 +284,7 @@ def _check_shapes(name: str, baked: BakedTransfer) -> None:
     container.unpack(header, baked.cluster, container.pack_weights(baked.weights), baked.bases,
                      (baked.albedo, baked.positions, baked.normals, baked.triangles), name, baked.tangents,
                      container.flatten_cloud(baked.cloud) if baked.cloud is not None else None, baked.material,
-                     baked.kernels)
+                     baked.kernels, None if baked.links is None else flatten_links(baked.links))
     if baked.weights.shape[1] != representatives - 1:
         raise StorageError(name, "the baked weights and bases do not belong together", container.REBAKE)
 
@@ -317,6 +322,9 @@ def _fill(mesh: bpy.types.Mesh, baked: BakedTransfer, header: dict, matrix: NDAr
     if baked.lamp_surfaces is not None:
         _write_attribute(mesh, container.MATERIAL_ATTRIBUTE, "INT", baked.material)
         mesh[container.KERNELS_PROPERTY] = np.ascontiguousarray(baked.kernels, np.float32).ravel()
+    write_live(mesh, baked.live)
+    if baked.links is not None:
+        mesh[container.LINKS_PROPERTY] = flatten_links(baked.links)
     if baked.error is not None:
         _write_attribute(mesh, container.ERROR_ATTRIBUTE, "FLOAT", baked.error)
     if baked.source is not None and not header["source"]["on_source_mesh"]:
@@ -402,9 +410,10 @@ def _clear_mesh(mesh: bpy.types.Mesh) -> None:
     for name in [a.name for a in mesh.attributes if a.name.startswith(OURS)]:
         mesh.attributes.remove(mesh.attributes[name])
     for key in (container.HEADER_PROPERTY, container.BASES_PROPERTY, container.CLOUD_PROPERTY,
-                container.KERNELS_PROPERTY, ATLAS_PROPERTY):
+                container.KERNELS_PROPERTY, container.LINKS_PROPERTY, ATLAS_PROPERTY):
         if key in mesh:
             del mesh[key]
+    clear_live(mesh)
     if active in mesh.color_attributes:
         mesh.color_attributes.active_color_name = active
     if default in mesh.color_attributes:

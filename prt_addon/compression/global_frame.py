@@ -22,6 +22,11 @@ from .workers import SERIAL, Workers
 CHUNK = 4096
 # Values from which on only the leading axes are looked for, how many at first and at most.
 WIDE, FIRST_WIDTH, MOST_WIDTH = 1024, 256, 768
+# Values from which on these are the axes of some points, and their number and the frame's are bounded by so many values
+# (256 MB): highlights in a cubemap's columns. Squares below this share of the largest are rounding.
+VERY_WIDE, MOST_SAMPLED, MOST_FRAME, FEWEST_AXES, NEGLIGIBLE = 1 << 14, 1 << 26, 1 << 25, 64, 1e-10
+# Numbers of a pass' rows.
+MOST_NUMBERS = 1 << 25
 # Points for each value from which the rotation is found.
 ENOUGH_POINTS = 24
 
@@ -50,12 +55,18 @@ class GlobalFrame:
         return min(max(1, int(np.searchsorted(-self.tail, -error))), self.coordinates.shape[1])
 
 
+def rows_at_once(values: int) -> int:
+    """Rows per pass of a signal of so many values."""
+    return max(1, min(CHUNK, MOST_NUMBERS // max(1, values)))
+
+
 def check_signal(signal: NDArray) -> None:
     """Raises PRTError unless the signal is a finite, non-empty (points, values) array."""
     if signal.ndim != 2 or 0 in signal.shape:
         raise PRTError("signal", f"shape {signal.shape} is not points x values", "Pass at least one point and value")
-    for start in range(0, signal.shape[0], CHUNK):
-        bad = ~np.isfinite(signal[start:start + CHUNK]).all(axis=1)
+    at_once = rows_at_once(signal.shape[1])
+    for start in range(0, signal.shape[0], at_once):
+        bad = ~np.isfinite(signal[start:start + at_once]).all(axis=1)
         if bad.any():
             point = start + int(bad.argmax())
             raise PRTError("signal", f"point {point} holds NaN or infinity", "Look at the geometry around that point")
@@ -148,8 +159,9 @@ def _mean_and_scale(signal: NDArray[np.floating]) -> tuple[NDArray[np.float64], 
     """See `_moments`."""
     points, values = signal.shape
     mean, low, high = np.zeros(values), np.full(values, np.inf), np.full(values, -np.inf)
-    for start in range(0, points, CHUNK):
-        block = signal[start:start + CHUNK]
+    at_once = rows_at_once(values)
+    for start in range(0, points, at_once):
+        block = signal[start:start + at_once]
         mean += block.sum(axis=0, dtype=np.float64)
         low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
     mean = (mean / points).astype(np.float32).astype(np.float64)
@@ -185,10 +197,41 @@ class _Wide:
 
     def blocks(self, workers: Workers) -> Iterator[tuple[slice, NDArray[np.float32]]]:
         """Centred rows in the metric, in single precision."""
-        for start in range(0, len(self.signal), CHUNK):
+        at_once = rows_at_once(self.signal.shape[1])
+        for start in range(0, len(self.signal), at_once):
             workers.tick()
-            part = slice(start, start + CHUNK)
+            part = slice(start, start + at_once)
             yield part, self.within(_centred(self.signal[part], self.mean, self.scale), self.root)
+
+
+def _sampled_axes(wide: _Wide, width: int, generator: np.random.Generator, workers: Workers) -> NDArray[np.float32]:
+    """Orthonormal axes (n, width) near the leading ones: see `leading_frame`."""
+    values = wide.signal.shape[1]
+    sample = np.zeros((values, width))
+    directions = generator.standard_normal((values, width), np.float32)
+    for _, block in wide.blocks(workers):
+        sample += multiply(block.T, multiply(block, directions))
+    return np.ascontiguousarray(linalg.qr(sample, mode="economic")[0], np.float32)
+
+
+def _axes_of_some(wide: _Wide) -> NDArray[np.float32]:
+    """Orthonormal axes (n, k): the principal ones of points evenly spread over the signal, from their products with
+    each other, which are few where values are very many."""
+    points, values = wide.signal.shape
+    count = min(points, max(FEWEST_AXES, min(MOST_SAMPLED // values, MOST_WIDTH + MOST_WIDTH // 2)))
+    places = np.unique(np.linspace(0, points - 1, count).astype(np.int64))
+    rows = wide.within(_centred(wide.signal[places], wide.mean, wide.scale), wide.root)
+    products = np.zeros((len(places),) * 2)
+    for start in range(0, values, CHUNK):
+        products += gram(np.ascontiguousarray(rows[:, start:start + CHUNK].T, np.float64))
+    squares, mix = symmetric_eigenpairs(products, max(FEWEST_AXES, min(MOST_WIDTH, MOST_FRAME // values)))
+    used = squares > NEGLIGIBLE * max(float(squares[0]), np.finfo(float).tiny)
+    used[0] = True
+    mix = mix[:, used] / np.sqrt(np.maximum(squares[used], np.finfo(float).tiny))
+    axes = np.empty((values, mix.shape[1]), np.float32)
+    for start in range(0, values, CHUNK):
+        axes[start:start + CHUNK] = multiply(rows[:, start:start + CHUNK].astype(np.float64).T, mix)
+    return axes
 
 
 def leading_frame(signal: NDArray[np.floating], metric: NDArray | None, left_out: float, workers: Workers = SERIAL,
@@ -197,19 +240,19 @@ def leading_frame(signal: NDArray[np.floating], metric: NDArray | None, left_out
     ones as leave out `left_out` of the energy, which tail[-1] holds and every error counts in.
 
     A randomised range finder with one power step (Halko, Martinsson & Tropp 2011, algorithm 4.4), made wider
-    until it holds enough or MOST_WIDTH is reached.
+    until it holds enough or MOST_WIDTH is reached; beyond VERY_WIDE the axes of some of the points.
     """
     points, values = signal.shape
     wide = _Wide.of(signal, metric)
     generator = np.random.default_rng(0)
     width, most = FIRST_WIDTH, min(points, values, MOST_WIDTH)
     while True:
-        width = min(width, most)
-        sample = np.zeros((values, width))
-        directions = generator.standard_normal((values, width), np.float32)
-        for _, block in wide.blocks(workers):
-            sample += multiply(block.T, multiply(block, directions))
-        basis = np.ascontiguousarray(linalg.qr(sample, mode="economic")[0], np.float32)
+        if values > VERY_WIDE:
+            basis = _axes_of_some(wide)
+            width = most = basis.shape[1]
+        else:
+            width = min(width, most)
+            basis = _sampled_axes(wide, width, generator, workers)
         coordinates = np.empty((points, width), np.float32)
         rest, energy, offset = 0.0, 0.0, wide.within(wide.mean[None] / wide.scale, wide.root)
         for part, block in wide.blocks(workers):

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from ..linear_algebra import multiply
 from .encoding import Encoding
-
-CHUNK = 4096  # points at a time: what a cluster of a whole object decodes to must not double the memory of a bake
+from .global_frame import rows_at_once
 
 
 def point_errors(signal: NDArray[np.floating], encoding: Encoding, metric: NDArray[np.float64] | None = None,
@@ -20,11 +19,13 @@ def point_errors(signal: NDArray[np.floating], encoding: Encoding, metric: NDArr
     decoding: a product per cluster.
     """
     squares, energy = np.empty(len(signal)), 0.0
+    # What a cluster of a whole object decodes to must not double the memory of a bake.
+    at_once = rows_at_once(signal.shape[1])
     order = np.argsort(encoding.cluster, kind="stable")
     starts = np.searchsorted(encoding.cluster[order], np.arange(len(encoding.bases) + 1))
     for cluster, basis in enumerate(encoding.bases):
-        for start in range(starts[cluster], starts[cluster + 1], CHUNK):
-            members = order[start:min(start + CHUNK, starts[cluster + 1])]
+        for start in range(starts[cluster], starts[cluster + 1], at_once):
+            members = order[start:min(start + at_once, starts[cluster + 1])]
             values = np.asarray(signal[members], np.float32)
             difference = values - basis[0] - multiply(encoding.weights[members], basis[1:])
             squares[members] = _squared_lengths(difference, metric)

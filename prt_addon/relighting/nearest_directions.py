@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from ..basis.cubemap import bilinear_texels, cubemap_solid_angles, texel_of
-from ..linear_algebra import row_squares
+from ..linear_algebra import multiply, row_squares
 from .exit_radiance import Baked
 
 Double = NDArray[np.float64]
@@ -50,31 +50,52 @@ def point_light_radiance(baked: Baked, positions: ArrayLike, r: int, light: Arra
     towards = np.asarray(light, np.float64) - np.asarray(positions, np.float64)
     square = np.maximum(row_squares(towards), np.finfo(np.float64).tiny)
     texels, shares = nearest_texels(towards, r, k)
-    alpha = (shares / cubemap_solid_angles(r)[texels] / square[:, None]).astype(np.float32)
-    result = np.zeros((len(towards), 3), np.float32)
-    # (clusters, columns, vectors + 1, channels): a receiver's vectors at a texel side by side.
-    bases = np.ascontiguousarray(baked.bases[:, :, 0].transpose(0, 2, 1, 3))
-    for start in range(0, len(towards), RECEIVERS_AT_ONCE):
+    alpha = shares / cubemap_solid_angles(r)[texels] / square[:, None]
+    return texel_radiance(baked, texels, alpha)[:, 0] * np.asarray(intensity, np.float32)
+
+
+def texel_radiance(baked: Baked, texels: NDArray[np.int64], radiance: Double) -> NDArray[np.float32]:
+    """Exit radiance (p, rows, 3), for unit albedo in row 0, where k texels (p, k) of each receiver's own shine with a
+    grey radiance (p, k): decoded there and nowhere else."""
+    rows, channels = baked.bases.shape[2], baked.bases.shape[4]
+    result = np.zeros((len(texels), rows, channels), np.float32)
+    radiance = radiance.astype(np.float32)
+    # (clusters, columns, vectors + 1, rows, channels): a receiver's vectors at a texel side by side.
+    bases = np.ascontiguousarray(baked.bases.transpose(0, 3, 1, 2, 4))
+    for start in range(0, len(texels), RECEIVERS_AT_ONCE):
         part = slice(start, start + RECEIVERS_AT_ONCE)
-        for which in range(k):
+        for which in range(texels.shape[1]):
             vectors = bases[baked.cluster[part], texels[part, which]]
-            transfer = vectors[:, 0] + np.sum(baked.weights[part, :, None] * vectors[:, 1:], axis=1)
-            result[part] += transfer * alpha[part, which, None]
-    return result * np.asarray(intensity, np.float32)
+            transfer = vectors[:, 0] + np.sum(baked.weights[part, :, None, None] * vectors[:, 1:], axis=1)
+            result[part] += transfer * radiance[part, which, None, None]
+    return np.broadcast_to(result, (len(texels), rows, 3)) if channels == 1 else result
+
+
+class Hull:
+    """The convex hull of points (p, 3), kept for many questions. Flat scenes have a flat hull: nothing beside its plane
+    is inside."""
+
+    def __init__(self, points: ArrayLike) -> None:
+        points = np.asarray(points, np.float64)
+        self._planes, self._slack = np.empty((0, 4)), 0.0
+        if len(points) < 4:
+            return
+        self._slack = SLACK * float(np.ptp(points, axis=0).max())
+        try:
+            self._planes = ConvexHull(points).equations
+        except QhullError:  # flat
+            return
+
+    def inside(self, places: ArrayLike) -> NDArray[np.bool_]:
+        """Whether places (n, 3) lie inside."""
+        places = np.atleast_2d(np.asarray(places, np.float64))
+        if not len(self._planes):
+            return np.zeros(len(places), bool)
+        heights = (multiply(places, np.ascontiguousarray(self._planes[:, :3].T)) + self._planes[:, 3]).max(axis=1)
+        return heights < -self._slack
 
 
 def inside_hull(points: ArrayLike, places: ArrayLike) -> NDArray[np.bool_]:
-    """Whether places (n, 3) lie inside the convex hull of points (p, 3), where the approximation is wrong.
-
-    Flat scenes have a flat hull: nothing beside its plane is inside.
+    """Whether places (n, 3) lie inside the convex hull of points (p, 3), where the approximation is wrong: see `Hull`.
     """
-    points, places = np.asarray(points, np.float64), np.atleast_2d(np.asarray(places, np.float64))
-    if len(points) < 4:
-        return np.zeros(len(places), bool)
-    extent = float(np.ptp(points, axis=0).max())
-    try:
-        planes = ConvexHull(points).equations
-    except QhullError:  # flat
-        return np.zeros(len(places), bool)
-    heights = np.max([np.sum(places * plane[:3], axis=1) + plane[3] for plane in planes], axis=0)
-    return heights < -SLACK * extent
+    return Hull(points).inside(places)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from . import svg_plots, wording
+from .basis_words import basis_line, candidate_rows, diffuse_words, uses_one_basis
 from .headline import headline, object_errors
 from .svg_plots import percent
 from .wording import count, duration, memory, number, plural
@@ -25,8 +26,8 @@ MOST_CURVES = len(svg_plots.SERIES_CLASSES)
 def render(report: Report) -> str:
     """The page of a valid report (see `report_file.problem_of`)."""
     style = Path(__file__).with_name("report.css").read_text("utf-8")
-    sections = (_attention, _times, _errors, _left_out, _cloud, _compression, _bounces, _checks, _settings,
-                _glossary)
+    sections = (_attention, _times, _errors, _sampling, _left_out, _basis, _cloud, _compression, _bounces, _checks,
+                _settings, _glossary)
     body = "\n".join(section(report) for section in sections)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -120,7 +121,7 @@ def _errors(report: Report) -> str:
     """The error budgets: plots with intervals and what to do about each part, objects, and what is not in them."""
     parts = []
     of_lamps = ("Bounced light of lamps", wording.LOCAL_ERRORS)
-    diffuse = of_lamps if report["settings"].get("lighting") == "local" else ("Diffuse light", wording.ERRORS)
+    diffuse = of_lamps if report["settings"].get("lighting") == "local" else ("Diffuse light", diffuse_words(report))
     for (title, words), key in ((diffuse, "errors"), (("Highlights", wording.HIGHLIGHT_ERRORS), "highlight_errors"),
                                 (of_lamps, "local_errors"),
                                 (("Highlights under lamps", wording.LOCAL_HIGHLIGHT_ERRORS), "local_highlight_errors")):
@@ -172,12 +173,38 @@ def _errors_of_objects(report: Report) -> str:
     return "<h3>Object by object</h3>" + _table((("Object", False), *((part, True) for part in found)), rows)
 
 
+def _sampling(report: Report) -> str:
+    """Which part of a cubemap's direct light was traced; nothing where all of it was."""
+    facts = report.get("sampling")
+    if not facts:
+        return ""
+    text = (f"Shadows of {percent(facts['traced'])} of all pairs of a point and a texel were traced, and those of the "
+            f"others woven from points near by; {percent(facts['dense'])} of the points were looked at closely. At "
+            f"{plural(facts['checked'], 'random point', 'random points')} all of them were traced: single ones are off "
+            f"by {percent(facts['element_error'])}, the light by {percent(facts['light_error'])}.")
+    return _section("Sparse sampling", f"<p>{escape(text)}</p>")
+
+
 def _left_out(report: Report) -> str:
     rows = [[escape(str(entry[key])) for key in ("what", "why", "saved")] for entry in report["left_out"]]
     if not rows:
         return _section("What was left out", "<p>Nothing: this scene needs every step of the bake.</p>")
     intro = '<p class="why">Work this scene does not need. Leaving it out makes no visible difference.</p>'
     return _section("What was left out", intro, _table((("What", False), ("Why", False), ("Saved", False)), rows))
+
+
+def _basis(report: Report) -> str:
+    """What the sky is held in, and what else an automatic choice weighed."""
+    line, rows = basis_line(report), candidate_rows(report, percent)
+    if not line:
+        return ""
+    heads = (("Sky by", False), ("Predicted error", True), ("Data", True), ("Time", True))
+    table = _table(heads, [[escape(cell) for cell in row] for row in rows]) if rows else ""
+    probe = (report.get("choice") or {}).get("probe")
+    told = f'<p class="why">Measured with {count(probe["rays"])} rays from ' \
+           f'{plural(probe["receivers"], "random point", "random points")} under the light of the bake: what of the ' \
+           "shadows each would lose, and what compressing it should add.</p>" if probe else ""
+    return _section("What the sky is held in", f"<p>{escape(line)}.</p>", told, table)
 
 
 def _cloud(report: Report) -> str:
@@ -219,9 +246,12 @@ def _compression(report: Report) -> str:
     """Clusters in numbers, and each object's error while its encoder ran."""
     clusters = report["clusters"]
     objects: dict[str, dict[str, Any]] = clusters.get("objects") or {}
-    intro = ('<p class="why">The points of an object are grouped into clusters; each point then needs only a few '
-             f"numbers. {plural(clusters['count'], 'cluster', 'clusters')} with {number(clusters['vectors_mean'])} "
-             f"vectors on average, total squared error {number(clusters['squared_error'])}, "
+    grouped = "All points of an object share one set of vectors; each point then needs only a few numbers" \
+        if uses_one_basis(report) else \
+        "The points of an object are grouped into clusters; each point then needs only a few numbers"
+    intro = (f'<p class="why">{grouped}. '
+             f"{plural(clusters['count'], 'cluster', 'clusters')} with {number(clusters['vectors_mean'])} vectors "
+             f"on average, total squared error {number(clusters['squared_error'])}, "
              f"overdraw {number(clusters['overdraw'])}.</p>")
     rows = [[escape(name), count(o.get("receivers")), count(o.get("count")), number(o.get("vectors_mean")),
              "unknown" if o.get("relative_error") is None else percent(_relative_rms(o)), number(o.get("overdraw"))]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from .basis_words import basis_line, diffuse_words
 from .headline import PARTS
 from .svg_plots import percent
 from .wording import ERRORS, HIGHLIGHT_ERRORS, LOCAL_ERRORS, LOCAL_HIGHLIGHT_ERRORS, STAGES, duration, memory
@@ -34,6 +35,8 @@ def summary(report: dict[str, Any]) -> list[SummaryLine]:
     seconds = max(report["seconds"] or 0.0, 1e-9)
     lines = [SummaryLine("fact", f"{duration(report['seconds'])}, {(report['rays'] or 0) / 1e6:.3g} million rays, "
                                  f"{memory(report['peak_bytes'])} of memory")]
+    if basis_line(report):
+        lines.append(SummaryLine("fact", basis_line(report)))
     for stage in report["stages"]:
         share = (stage["seconds"] or 0.0) / seconds  # what was not finite is None
         if share >= SMALL_SHARE:
@@ -60,5 +63,5 @@ def _errors(report: dict[str, Any]) -> Iterator[SummaryLine]:
         local = key == "errors" and (report.get("settings") or {}).get("lighting") == "local"
         yield SummaryLine("heading", f"Error of {'bounced light of lamps' if local else TITLES.get(part, part)}")
         for name in sorted(values, key=lambda n: (n != "total", -values[n])):
-            words = WORDS[key].get(name, (name, ""))[0]
+            words = (diffuse_words(report) if key == "errors" else WORDS[key]).get(name, (name, ""))[0]
             yield SummaryLine("error", f"{words}  {percent(values[name])}", values[name] / largest)

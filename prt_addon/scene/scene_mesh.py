@@ -107,13 +107,14 @@ class SceneMesh:
 
     @staticmethod
     def assemble(objects: list[ObjectMesh], spacing: float = 0.0, lamps: NDArray[np.float64] | None = None,
-                 texels: TexelChoice | None = None) -> SceneMesh:
+                 texels: TexelChoice | None = None, split_slots: bool = False) -> SceneMesh:
         """Join objects into one scene.
 
         spacing: longest edge that a triangle may have, as a fraction of the targets' bounding diagonal, and beyond
         that diagonal of the distance from them; 0 keeps the meshes as they are. lamps: (n, 3) places inside rooms,
-        which stay wound inwards. texels: which targets get texels as receivers, so far apart (None: none). Raises
-        BadScene, naming the object, where nothing can be baked.
+        which stay wound inwards. texels: which targets get texels as receivers, so far apart (None: none). split_slots:
+        a point belongs to one material slot, even where two slots look the same, so that one can be changed later.
+        Raises BadScene, naming the object, where nothing can be baked.
         """
         if not any(o.is_target for o in objects):
             raise BadScene("scene", "no mesh object to bake", "Select a mesh object, or make one visible in renders")
@@ -127,7 +128,7 @@ class SceneMesh:
             raise BadScene(name, "all vertices lie in one point", "Give the object a size")
         limit = EdgeLimit(spacing * diagonal, targets.min(axis=0), targets.max(axis=0))
         materials, numbers = _number_materials(cleaned)
-        parts = [_split(o, of_triangle, limit, warnings, texels if o.is_target else None)
+        parts = [_split(o, of_triangle, limit, warnings, texels if o.is_target else None, split_slots)
                  for o, of_triangle in zip(cleaned, numbers, strict=True)]
         return _join(cleaned, parts, materials, tuple(warnings))
 
@@ -209,13 +210,16 @@ def _corner_groups(mesh: ObjectMesh, material: NDArray[np.int32], tangent: NDArr
 
 
 def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warnings: list[str],
-           texels: TexelChoice | None = None) -> _Part:
+           texels: TexelChoice | None = None, split_slots: bool = False) -> _Part:
     """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined, or get texels.
 
     material: (t,) number of each triangle's.
     """
     tangent = _unit_corner_tangents(mesh)
-    group, count = _corner_groups(mesh, material, tangent)
+    apart = material
+    if split_slots and mesh.material_index is not None:
+        apart = material * np.int32(len(mesh.materials) + 1) + mesh.material_index.astype(np.int32)
+    group, count = _corner_groups(mesh, apart, tangent)
     points = np.empty((count, 3))
     points[:len(mesh.positions)] = mesh.positions
     points[group] = mesh.positions[mesh.triangles.ravel()]

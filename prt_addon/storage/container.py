@@ -16,9 +16,12 @@ from ..errors import StorageError
 from ..lighting.light_cloud import LightCloud
 from ..lighting.lit_surfaces import LitSurfaces, LocalBasis
 from ..relighting.lamp_highlights import LampSurfaces
+from ..relighting.live_scattering import SubsurfaceLinks
 from ..scene.texel_surface import TexelSurface
+from ..transport.live_operator import LiveOperator
 from .columns import LIT_SURFACES, Columns, cloud_part, cubemap_size, read_columns
 from .lamp_surfaces import read_lamp_surfaces
+from .subsurface_links import read_links
 from .texels import ENTRY as ATLAS_ENTRY
 
 # Highest that is read; 1: constant rows only; 2: rows of the view, too; 3: columns of a light cloud, too; 4: of a
@@ -34,6 +37,8 @@ MATERIAL_ATTRIBUTE = "prt_material"
 ERROR_ATTRIBUTE = "prt_error"
 SOURCE_ATTRIBUTE = "prt_source"
 KERNELS_PROPERTY = "prt_kernels"
+LIVE_ENTRY = "live_editing"  # in headers: which form factors, and where its rows begin; also a setting's name
+LINKS_PROPERTY = "prt_links"
 REBAKE = "Bake the object again"
 CONSTANT_ROWS: dict[str, Any] = {"kind": "constant"}
 HEMISPHERE_KIND = "constant_and_hemisphere"
@@ -58,8 +63,10 @@ class BakedTransfer:
     lamp_surfaces: what materials do to the direct light of lamps, where there are a cloud and view-dependent rows.
     source: (t,) int32, which of the source mesh's triangles each one is or is a part of; None in bakes that did not
     keep it. error: (p,) float32, how far off M_p is, relative to the RMS of the object's transfer; None likewise.
+    live: the form factors of the whole bake, on one of its objects, where it keeps them for edits of materials.
     texels: the surface that points lie on where they are texels, triangles then joining neighbouring ones; None where
     points are vertices.
+    links: for the light of lamps through translucent parts, where it was asked for.
 
     Exit radiance towards a view is albedo * row 0 + sum_i y_i(view) * row i over `functions`, the view in the frame of
     x tangent, y normal x tangent, z normal.
@@ -78,7 +85,9 @@ class BakedTransfer:
     lamp_surfaces: LampSurfaces | None = None
     source: NDArray[np.int32] | None = None
     error: NDArray[np.float32] | None = None
+    live: LiveOperator | None = None
     texels: TexelSurface | None = None
+    links: SubsurfaceLinks | None = None
 
     @property
     def drawn(self) -> tuple[NDArray[np.floating], NDArray[np.int32], NDArray[np.int32] | None]:
@@ -205,11 +214,12 @@ def pack_weights(weights: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArray], flat_bases: NDArray,
            geometry: tuple[NDArray, NDArray, NDArray, NDArray], subject: str, tangents: NDArray | None = None,
            flat_cloud: NDArray | None = None, material: NDArray | None = None, flat_kernels: NDArray | None = None,
-           ) -> BakedTransfer:
+           flat_links: NDArray | None = None) -> BakedTransfer:
     """The container from stored arrays, checked against the header.
 
     geometry: albedo, positions, normals (p, 3) and triangles (t, 3); tangents (p, 3) where rows need them; flat_cloud:
-    of `flatten_cloud` where columns need it; material (p,) and flat_kernels where the header has lamp surfaces.
+    of `flatten_cloud` where columns need it; material (p,) and flat_kernels where the header has lamp surfaces;
+    flat_links where it has links.
     Raises StorageError where a shape, an index or a value can't be right, so that broken data is never drawn.
     """
     clusters, representatives, rows, columns, channels = check_header(header, subject)["shape"]
@@ -240,7 +250,8 @@ def unpack(header: dict[str, Any], cluster: NDArray, packed_weights: list[NDArra
                          np.asarray(normals, np.float32), np.asarray(triangles, np.int32),
                          None if tangents is None else np.asarray(tangents, np.float32),
                          read_cloud(header, flat_cloud, subject),
-                         read_lamp_surfaces(header, material, flat_kernels, points, subject, REBAKE))
+                         read_lamp_surfaces(header, material, flat_kernels, points, subject, REBAKE),
+                         links=read_links(header, flat_links, points, subject, REBAKE))
 
 
 def flatten_cloud(cloud: LocalBasis) -> NDArray[np.floating]:

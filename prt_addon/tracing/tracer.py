@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,29 +21,17 @@ from ..errors import PRTError
 from ..scene.object_mesh import bounding_diagonal
 from ..scene.scene_mesh import SceneMesh
 from ..scene.texel_surface import TracedSurface
+from .hits import Hits
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Hits:
-    """Nearest hits of n rays. triangle: (n,) int32, -1 for a miss; u, v: barycentric weights of corners 1 and 2;
-    front: (n,) bool, the ray met the side that the triangle winds counter-clockwise on; distance: (n,) in tracing space
-    (of world space, divided by the scene's diagonal)."""
-
-    triangle: NDArray[np.int32]
-    u: NDArray[np.float32]
-    v: NDArray[np.float32]
-    front: NDArray[np.bool_]
-    distance: NDArray[np.float32]
-    traced: tuple[NDArray, NDArray, NDArray] | None = None  # triangle, u, v on the true surface under texels
 
 
 class Tracer:
     """Embree over one triangle soup.
 
     points: (p, 3) float64 world space; triangles: (t, 3) int32; threads: workers of `map_in_order` (0 = one for each
-    core that this process may use). `rays` counts every ray traced.
+    core that this process may use); surface: what triangles stand for where receivers are texels. `rays` counts every
+    ray traced.
     """
 
     def __init__(self, points: NDArray[np.float64], triangles: NDArray[np.int32], threads: int = 0,
@@ -62,6 +49,11 @@ class Tracer:
     def of_scene(scene: SceneMesh, threads: int = 0) -> Tracer:
         """Over a scene's true surface; hits are named by the scene's own triangles, which join its points."""
         return Tracer(*scene.shape, threads, scene.traced)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Who traced, for the report."""
+        return {"name": "Embree", "threads": self.threads}
 
     def to_tracing_space(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """World positions (n, 3) as Embree sees them."""
@@ -84,10 +76,32 @@ class Tracer:
         found = self._scene.run(origins, directions, query="INTERSECT", output=1)
         # Embree's geometric normal follows the winding, so a ray against it meets the front.
         front = np.sum(found["Ng"] * directions, axis=1) < 0.0
+        return self._named(Hits(found["primID"], found["u"], found["v"], front, found["tfar"]))
+
+    def _named(self, hits: Hits) -> Hits:
+        """Hits of the traced surface, by the triangles that join the scene's points."""
         if self.surface is None:
-            return Hits(found["primID"], found["u"], found["v"], front, found["tfar"])
-        traced = found["primID"], found["u"], found["v"]
-        return Hits(*self.surface.named(*traced), front, found["tfar"], traced)
+            return hits
+        traced = hits.triangle, hits.u, hits.v
+        return Hits(*self.surface.named(*traced), hits.front, hits.distance, traced)
+
+    def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                       asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the rays that are asked for among all (directions, origins) hit anything: the same shape, False
+        where nothing is asked. One direction after the other: coherent rays."""
+        found = np.zeros(asked.shape, bool)
+        for index in range(len(directions)):
+            chosen = np.flatnonzero(asked[index])
+            hit = self.occluded(np.take(origins, chosen, axis=0), directions[index:index + 1])
+            found[index, chosen[hit]] = True
+        return found
+
+    def nearest_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32], asked: NDArray[np.bool_],
+                      ) -> tuple[NDArray[np.int64], NDArray[np.int64], Hits]:
+        """Of the rays that are asked for among all (directions, origins), in that order: which direction, which origin,
+        and the nearest hits."""
+        which, row = np.nonzero(asked)
+        return which, row, self.nearest(np.take(origins, row, axis=0), np.take(directions, which, axis=0))
 
     def map_in_order(self, work: Callable[[Any], Result], items: Iterable[Any]) -> Iterator[tuple[Any, Result]]:
         """Run `work` on items in threads, yielding (item, result) in the items' order.

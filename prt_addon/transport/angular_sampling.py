@@ -66,13 +66,18 @@ def _bordered_grid(r: int) -> Places:
 
 def dense_rows(elements: Elements, vertices: Places) -> DenseRows:
     """Sample vertices (n,) as dense ones, in blocks; deterministic, whatever else is sampled before or with them."""
-    values = np.empty((len(vertices), elements.columns), np.float32)
-    features = np.zeros(values.shape, bool)
+    rows = DenseRows(np.zeros((len(vertices), elements.columns), np.float32),
+                     np.zeros((len(vertices), elements.columns), bool))
     for start in range(0, len(vertices), VERTICES):
-        part = slice(start, start + VERTICES)
-        sample = _two_passes if elements.angular else _one_pass
-        sample(elements, vertices[part], values[part], features[part])
-    return DenseRows(values, features)
+        sample_rows(elements, vertices[start:start + VERTICES], rows, start)
+    return rows
+
+
+def sample_rows(elements: Elements, vertices: Places, rows: DenseRows, start: int) -> None:
+    """Sample at most VERTICES vertices into zeros of rows, from number `start` on."""
+    part = slice(start, start + len(vertices))
+    sample = _two_passes if elements.angular else _one_pass
+    sample(elements, vertices, rows.values[part], rows.features[part])
 
 
 def _first_pass(elements: Elements, vertices: Places, unknown: NDArray[np.bool_]) -> tuple[Single, NDArray[np.bool_]]:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ..errors import PRTError
 
@@ -22,19 +23,20 @@ Single = NDArray[np.float32]
 COLUMNS_AT_ONCE = 256
 
 
-def column_array(columns: int, receivers: int, budget: int | None = None, folder: Path | None = None) -> Single:
-    """Zeros (columns, receivers) float32: in memory where they take at most `budget` bytes (None: always), else in a
-    nameless file of `folder` (None: the system's for temporary files), which goes away with the array.
+def column_array(columns: int, receivers: int, budget: int | None = None, folder: Path | None = None,
+                 kind: DTypeLike = np.float32) -> NDArray[Any]:
+    """Zeros (columns, receivers): in memory where they take at most `budget` bytes (None: always), else in a nameless
+    file of `folder` (None: the system's for temporary files), which goes away with the array.
 
     Raises PRTError where the disk has no room for it.
     """
-    size = 4 * columns * receivers
+    size = np.dtype(kind).itemsize * columns * receivers
     if budget is None or size <= budget or not size:
-        return np.zeros((columns, receivers), np.float32)
+        return np.zeros((columns, receivers), kind)
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.truncate(size)
-            return np.memmap(file, np.float32, "r+", shape=(columns, receivers))
+            return np.memmap(file, kind, "r+", shape=(columns, receivers))
     except OSError as error:
         raise PRTError(str(folder or tempfile.gettempdir()), f"{size / 1e9:.1f} GB of transfer can't be written there "
                        f"({error.strerror or error})", "Free some disk space, or choose a smaller cubemap") from error

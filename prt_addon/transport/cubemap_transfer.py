@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..basis.cubemap import grid_solid_angles, sample_directions, texel_count, texel_edges
+from ..basis.cubemap import texel_count
 from ..linear_algebra import multiply
 from ..tracing.tracer import Tracer
 from .column_arrays import COLUMNS_AT_ONCE, column_array, column_blocks
 from .direct import CHUNK, cosine_visibility
 from .interreflection import Interreflection, interreflect
 from .receiver_set import Block, ReceiverSet, blocks, facing_cosines
+from .texel_visibility import TexelVisibility, part_solid_angles, texel_directions
 
 Single = NDArray[np.float32]
 
@@ -54,30 +55,37 @@ def samples_along(r: int) -> int:
 
 
 def cubemap_transfer(tracer: Tracer, receivers: ReceiverSet, r: int, samples: int = 0, shadow_rays: bool = True,
-                     budget: int | None = None, folder: Path | None = None) -> Generator[float, None, Single]:
+                     budget: int | None = None, folder: Path | None = None, plain: TexelVisibility | None = None,
+                     ) -> Generator[float, None, Single]:
     """Yield progress, return unit-albedo direct transfer (6 r r, receivers) float32, columns first, in the receivers'
     order.
 
     samples: directions along a texel's edge, 0 = `samples_along`; each has the exact solid angle of its part of the
     texel. shadow_rays: False where nothing can be hit. budget, folder: of `column_array`. The finite directions' error
     on an open hemisphere's cosine is taken out by one factor per receiver: the columns of a receiver that sees the
-    whole sky add up to 1. Independent of threads.
+    whole sky add up to 1. Independent of threads. plain: collects the visibility itself from the same rays, for the
+    receivers whose glossy rows need it.
     """
     samples = samples or samples_along(r)
     result = column_array(texel_count(r), len(receivers), budget, folder)
     total, done = max(1, result.size), 0
 
-    def trace(task: _Task) -> tuple[Single, int]:
+    def trace(task: _Task) -> tuple:
         place = task.block.receivers
-        _, visible, rays = cosine_visibility(tracer if shadow_rays else None, receivers, place, task.directions)
+        cosines, visible, rays = cosine_visibility(tracer if shadow_rays else None, receivers, place, task.directions)
+        which = slice(task.texels.start * samples ** 2, task.texels.stop * samples ** 2)
+        sample = plain and plain.sample(receivers, place, which, task.directions, task.weights * np.float32(np.pi),
+                                        cosines, visible)
         visible *= task.weights[:, None]
         texels = task.texels.stop - task.texels.start
         part = visible.reshape(texels, -1, visible.shape[1]).sum(axis=1) if samples > 1 else visible
         part *= task.scale
-        return part, rays
+        return part, rays, sample
 
-    for task, (part, rays) in tracer.map_in_order(trace, _tasks(receivers, r, samples)):
+    for task, (part, rays, sample) in tracer.map_in_order(trace, _tasks(receivers, r, samples)):
         result[task.texels, task.block.receivers] = part
+        if sample is not None:
+            plain.add(sample)
         tracer.rays += rays
         done += part.size
         yield done / total
@@ -87,8 +95,8 @@ def cubemap_transfer(tracer: Tracer, receivers: ReceiverSet, r: int, samples: in
 def _tasks(receivers: ReceiverSet, r: int, samples: int) -> Iterator[_Task]:
     """Chunks of texels for every block of receivers."""
     count = samples * samples
-    directions = np.ascontiguousarray(sample_directions(r, samples).reshape(-1, 3), np.float32)
-    weights = _part_weights(r, samples)
+    directions = texel_directions(r, samples)
+    weights = (part_solid_angles(r, samples) / np.pi).astype(np.float32)
     at_once = max(1, CHUNK // count)
     for block in blocks(len(receivers), 0, 0):
         normals = receivers.normals[block.receivers]
@@ -101,12 +109,6 @@ def _tasks(receivers: ReceiverSet, r: int, samples: int) -> Iterator[_Task]:
         for texels in column_blocks(texel_count(r), at_once):
             part = slice(texels.start * count, texels.stop * count)
             yield _Task(block, texels, directions[part], weights[part], scale)
-
-
-def _part_weights(r: int, samples: int) -> Single:
-    """Solid angles over pi (6 r r * samples^2,) of the parts of all texels, in the order of `sample_directions`."""
-    face = grid_solid_angles(texel_edges(r * samples)).reshape(r, samples, r, samples).transpose(0, 2, 1, 3)
-    return np.tile((face / np.pi).ravel(), 6).astype(np.float32)
 
 
 def bounced_columns(matrix: sparse.csr_matrix, albedo: Single, direct: Single, tolerance: float, bounces: int = -1,

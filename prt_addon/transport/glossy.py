@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from ..basis.directions import tangent_frames
 from ..basis.hemisphere import Indices
 from ..basis.spherical_harmonics import order_of, rotations
 from ..basis.triple_product import triple_products
-from ..linear_algebra import multiply, small_batched_multiply
+from ..linear_algebra import multiply, wide_batched_multiply
 from ..tracing.tracer import Tracer
 from .incident_light import BLOCK, NUMBERS, IndirectLight
 from .positivity import OpenSurface, keep_positive
@@ -72,34 +73,88 @@ def surface_frames(normals: NDArray[np.float64], tangents: NDArray[np.float64]) 
     return frames
 
 
+class DirectLight(Protocol):
+    """Light from the sky in some columns, for blocks of the receivers."""
+
+    columns: int
+
+    def incident(self, part: slice) -> NDArray[np.float32] | None:
+        """T (b, incident functions, columns) in the global frame; None where direct light is left out."""
+
+    def white(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What rows (b, k, columns, channels) make of a white world: (b, k, channels), up to a factor."""
+
+
+@dataclass(frozen=True)
+class HarmonicLight:
+    """Direct light in the spherical harmonics of an order, for incident functions of an order, from the visibility (g,
+    k^2), k = incident order + order - 1, of VisibilityCoefficients."""
+
+    order: int
+    incident_order: int
+    visible: NDArray[np.float32] | None
+
+    @property
+    def columns(self) -> int:
+        """Functions."""
+        return self.order ** 2
+
+    def incident(self, part: slice) -> NDArray[np.float32] | None:
+        """See DirectLight."""
+        if self.visible is None:
+            return None
+        products = triple_products(self.incident_order, self.order).astype(np.float32)
+        return multiply(self.visible[part], products).reshape(-1, self.incident_order ** 2, self.columns)
+
+    @staticmethod
+    def white(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See DirectLight."""
+        return rows[:, :, 0]
+
+
 def glossy_transfer(tracer: Tracer, surfaces: GlossySurfaces, light_order: int, visible: NDArray[np.float32] | None,
                     indirect: IndirectLight | None = None, out: NDArray[np.float32] | None = None,
                     diffuse: NDArray[np.float32] | None = None) -> Generator[float, None, NDArray[np.float32]]:
-    """Yield progress, return M (g, rows, light_order^2, channels) float32.
+    """Yield progress, return M (g, rows, light_order^2, channels) float32: `filled_rows` in spherical harmonics.
 
-    visible: (g, k^2), k = incident order + light_order - 1, from VisibilityCoefficients; None leaves direct light out.
-    indirect: light from other surfaces, of light_order^2 columns and 1 or 3 channels; the result has as many channels
-    as the kernels or the indirect light, whichever has more. out: an array of the result's shape to write into (it may
-    be a part of a larger one). diffuse: (g, light_order^2 * channels of the indirect light), takes what the indirect
-    light adds to the unit-albedo diffuse row (of use for a glossy bounce: the gather operator knows the diffuse ones).
-    tracer: for its threads; nothing is traced.
+    visible: see `HarmonicLight`; None leaves direct light out.
     """
     if visible is None and indirect is None:
         raise ValueError("glossy_transfer needs the visibility, indirect light, or both")
-    columns, channels = light_order ** 2, surfaces.kernels[0].shape[2]
+    direct = HarmonicLight(light_order, surfaces.incident_order, visible)
+    return (yield from filled_rows(tracer, surfaces, direct, indirect, out, diffuse))
+
+
+def rows_shape(surfaces: GlossySurfaces, columns: int, indirect: IndirectLight | None) -> tuple[int, int, int, int]:
+    """(g, rows, columns, channels) of a fill: as many channels as the kernels or the indirect light, whichever has
+    more."""
+    channels = surfaces.kernels[0].shape[2]
     if indirect is not None:
         channels = max(channels, indirect.source.values // columns)
-    shape = (len(surfaces), surfaces.kernels[0].shape[0], columns, channels)
+    return len(surfaces), surfaces.kernels[0].shape[0], columns, channels
+
+
+def filled_rows(tracer: Tracer, surfaces: GlossySurfaces, direct: DirectLight, indirect: IndirectLight | None = None,
+                out: NDArray[np.float32] | None = None, diffuse: NDArray[np.float32] | None = None,
+                ) -> Generator[float, None, NDArray[np.float32]]:
+    """Yield progress, return M (g, rows, columns, channels) float32, see `rows_shape`, of any columns of distant light.
+
+    indirect: light from other surfaces, of as many columns and 1 or 3 channels. out: an array of the result's shape to
+    write into (it may be a part of a larger one, or lie on disk). diffuse: (g, columns * channels of the indirect
+    light), takes what the indirect light adds to the unit-albedo diffuse row (of use for a glossy bounce: the gather
+    operator knows the diffuse ones). tracer: for its threads; nothing is traced.
+    """
+    columns, shape = direct.columns, rows_shape(surfaces, direct.columns, indirect)
     out = np.empty(shape, np.float32) if out is None else out
     if out.shape != shape:
         raise ValueError(f"glossy_transfer: out must be {shape}, not {out.shape}")
 
     def fill(part: slice) -> None:
-        incident = _incident(surfaces, light_order, part, visible, indirect, diffuse)
-        _reflect(surfaces, part, _to_surface(surfaces.frames[part], incident), columns, out[part])
+        incident = _incident(direct, part, indirect, diffuse)
+        _reflect(surfaces, part, _to_surface(surfaces.frames[part], incident), columns, out[part], direct)
 
     for part, _ in tracer.map_in_order(fill, _blocks(surfaces, columns) if indirect is None else indirect.blocks()):
-        yield part.stop / len(surfaces)
+        yield part.stop / max(1, len(surfaces))
     return out
 
 
@@ -132,20 +187,17 @@ def _blocks(surfaces: GlossySurfaces, columns: int) -> Iterator[slice]:
         yield slice(start, min(start + size, len(surfaces)))
 
 
-def _incident(surfaces: GlossySurfaces, light_order: int, part: slice, visible: NDArray[np.float32] | None,
-              indirect: IndirectLight | None, diffuse: NDArray[np.float32] | None) -> NDArray[np.float32]:
+def _incident(direct: DirectLight, part: slice, indirect: IndirectLight | None,
+              diffuse: NDArray[np.float32] | None) -> NDArray[np.float32]:
     """T (b, incident functions, columns * channels) in the global frame, direct and indirect light together."""
-    shape = (-1, surfaces.incident_order ** 2, light_order ** 2)
-    if visible is not None:
-        products = triple_products(surfaces.incident_order, light_order).astype(np.float32)
-        direct = multiply(visible[part], products).reshape(shape)
+    sky = direct.incident(part)
     if indirect is None:
-        return direct
+        return sky
     incident, irradiance = indirect.transfer(part)
     if diffuse is not None:
         diffuse[part] = irradiance
-    if visible is not None:
-        incident.reshape(*direct.shape, -1)[...] += direct[..., None]
+    if sky is not None:
+        incident.reshape(*sky.shape, -1)[...] += sky[..., None]
     return incident
 
 
@@ -154,12 +206,12 @@ def _to_surface(frames: NDArray[np.float64], incident: NDArray[np.float32]) -> N
     result = np.empty_like(incident)
     for band, block in enumerate(rotations(order_of(incident.shape[1]), frames)):
         rows = slice(band * band, (band + 1) ** 2)
-        small_batched_multiply(block.astype(np.float32), incident[:, rows], out=result[:, rows])
+        wide_batched_multiply(block.astype(np.float32), incident[:, rows], out=result[:, rows])
     return result
 
 
 def _reflect(surfaces: GlossySurfaces, part: slice, incident: NDArray[np.float32], columns: int,
-             out: NDArray[np.float32]) -> None:
+             out: NDArray[np.float32], direct: DirectLight | None = None) -> None:
     """K times incident radiance (b, n^2, columns * channels) in the tangent frame, into out (b, rows, columns,
     channels). The kernels of each material are shared by its receivers."""
     material = surfaces.material[part]
@@ -168,11 +220,11 @@ def _reflect(surfaces: GlossySurfaces, part: slice, incident: NDArray[np.float32
         light = incident if len(members) == len(material) else incident[members]
         light = light.reshape(*light.shape[:2], columns, -1)
         kernel = np.asarray(surfaces.kernels[number], np.float32)
-        reflected = [small_batched_multiply(np.ascontiguousarray(kernel[None, :, :, min(c, kernel.shape[2] - 1)]),
-                                            np.ascontiguousarray(light[..., min(c, light.shape[3] - 1)]))
+        reflected = [wide_batched_multiply(np.ascontiguousarray(kernel[None, :, :, min(c, kernel.shape[2] - 1)]),
+                                           np.ascontiguousarray(light[..., min(c, light.shape[3] - 1)]))
                      for c in range(out.shape[3])]
         place = slice(None) if len(members) == len(material) else members
         rows = np.stack(reflected, axis=-1)
         if surfaces.open_surfaces:
-            keep_positive(rows, surfaces.open_surfaces[number])
+            keep_positive(rows, surfaces.open_surfaces[number], direct and direct.white(rows))
         out[place] = rows

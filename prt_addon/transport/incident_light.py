@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..basis.spherical_harmonics import evaluate, order_of
-from ..linear_algebra import small_batched_multiply, sparse_multiply
+from ..linear_algebra import sparse_multiply, wide_batched_multiply
 from ..scene.scene_mesh import SceneMesh
 from .hit_record import HitRecord
 from .receiver_set import ReceiverSet
@@ -108,7 +108,7 @@ class GlossyRadiance:
         surfaces, starts, counts = np.unique(which, return_index=True, return_counts=True)
         at_once = max(1, NUMBERS // (values.shape[1] * self.values))
         for group, items, filled in padded_groups(starts, counts, at_once):
-            products = small_batched_multiply(values[items], self._matrices[surfaces[group]])
+            products = wide_batched_multiply(values[items], self._matrices[surfaces[group]])
             radiance[items[filled]] = products[filled]
         back = np.argsort(entry // 3, kind="stable")
         first = np.concatenate([[0], np.cumsum(np.bincount(entry // 3, minlength=len(hits)))])
@@ -203,7 +203,7 @@ class IndirectLight:
         for group, items, filled in padded_groups(np.cumsum(counts) - counts, counts, at_once):
             weights = np.where(filled, record.solid_angle[hits[items]], np.float32(0.0))
             weighted = functions[record.direction[hits[items]]] * weights[:, :, None]
-            sums = small_batched_multiply(weighted.transpose(0, 2, 1), radiance[items])
+            sums = wide_batched_multiply(weighted.transpose(0, 2, 1), radiance[items])
             sampled = weighted.sum(axis=1)
             mean = sums[:, :1] / sampled[:, :1, None]
             result[group] = sums + (self.blocked[part][group] - sampled)[:, :, None] * mean

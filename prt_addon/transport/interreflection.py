@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from .krylov import SMALLEST, bicgstab_cycle, column_norm
+
 # A ratio of successive bounces above this is a slow series: 1/(1-0.7) = 3.3 times the steps of BiCGSTAB at equal error.
 SLOW_RATIO = 0.7
 # A closed room that reflects everything has no finite answer; no material reflects more than fresh snow or spectralon.
@@ -93,57 +95,16 @@ def _krylov(matrix: sparse.csr_matrix, albedo: NDArray[np.float32], direct: NDAr
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values - _bounce(operator, rho, values)
 
-    size = np.maximum(_column_norm(right), np.finfo(np.float64).tiny * 1e30)
+    size = np.maximum(column_norm(right), SMALLEST)
     steps = len(history)
     worst = np.inf
     while steps < MAXIMUM_STEPS:
         residual = right - apply(solution)
         steps += 1
-        worst = float((_column_norm(residual) / size).max())
+        worst = float((column_norm(residual) / size).max())
         if worst <= tolerance:
             break
-        # Restarted every 30 steps and on breakdown: the true residual is taken anew, rounding can't pile up.
-        used = yield from _bicgstab_cycle(apply, solution, residual, size, tolerance, history)
+        # Restarted every CYCLE steps and on breakdown: the true residual is taken anew, rounding can't pile up.
+        used = yield from bicgstab_cycle(apply, solution, residual, size, tolerance, history)
         steps += used
     return Interreflection(solution.astype(np.float32), -1, "BiCGSTAB", worst, steps, history)
-
-
-def _bicgstab_cycle(apply, solution: NDArray[np.float64], residual: NDArray[np.float64],  # noqa: ANN001
-                    size: NDArray[np.float64], tolerance: float, history: list[float],
-                    ) -> Generator[float, None, int]:
-    """Improve `solution` in place by up to 30 steps; return the number of operator products."""
-    shadow, direction = residual.copy(), residual.copy()
-    rho = _dot(shadow, residual)
-    products = 0
-    for _ in range(30):
-        image = apply(direction)
-        alpha = _quotient(rho, _dot(shadow, image))
-        half = residual - alpha * image
-        half_image = apply(half)
-        omega = _quotient(_dot(half_image, half), _dot(half_image, half_image))
-        products += 2
-        solution += alpha * direction + omega * half
-        residual = half - omega * half_image
-        worst = float((_column_norm(residual) / size).max())
-        history.append(worst)
-        yield min(1.0, np.log(max(worst, 1e-300)) / np.log(tolerance)) if worst < 1.0 else 0.0
-        following = _dot(shadow, residual)
-        if worst <= 0.5 * tolerance or not np.any(following):
-            break
-        direction = residual + _quotient(following, rho) * _quotient(alpha, omega) * (direction - omega * image)
-        rho = following
-    return products
-
-
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inner products of columns: (columns, channels)."""
-    return np.sum(a * b, axis=0)
-
-
-def _column_norm(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.sqrt(_dot(values, values))
-
-
-def _quotient(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """a / b, and 0 for a column that is solved already (0 / 0)."""
-    return np.divide(a, b, out=np.zeros_like(a), where=b != 0.0)

@@ -87,14 +87,19 @@ class OpenSurface:
         return OpenSurface(functions, shape)
 
 
-def keep_positive(matrices: NDArray[np.float32], surface: OpenSurface) -> NDArray[np.float32]:
-    """Change matrices (b, k, columns, channels) in place as the module's docstring says; their factors t (b,)."""
+def keep_positive(matrices: NDArray[np.float32], surface: OpenSurface, in_white: NDArray[np.float32] | None = None,
+                  ) -> NDArray[np.float32]:
+    """Change matrices (b, k, columns, channels) in place as the module's docstring says; their factors t (b,).
+
+    in_white: (b, k, channels) what they make of a white world, up to a factor; None: their first column, that of
+    spherical harmonics' constant."""
+    in_white = matrices[:, :, 0] if in_white is None else in_white
     values, means = _views(tuple(surface.functions))
     values, means = np.ascontiguousarray(values), means.astype(np.float32)
     factor = np.ones(len(matrices), np.float32)
     response = np.broadcast_to(surface.response, (len(means), matrices.shape[3])).astype(np.float32)
     for channel, shape in enumerate(response.T):
-        white = np.ascontiguousarray(matrices[:, :, 0, channel])
+        white = np.ascontiguousarray(in_white[:, :, channel])
         seen = multiply(white, values)
         # The target at each view; where a receiver's own mean is below black there is nothing to draw it to but that.
         target = np.sum(white * means, axis=1)[:, None] * np.sum(values * shape[:, None], axis=0)

@@ -13,7 +13,7 @@ It pays only where an element costs much more than a ray (docs/sparse_precomputa
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,7 +26,8 @@ from ..linear_algebra import multiply
 from ..scene.object_mesh import bounding_diagonal
 from ..scene.receivers import morton_order
 from . import sparse_weights
-from .angular_sampling import DenseRows, dense_rows, edge_of, quarter_grid
+from .angular_sampling import VERTICES as BLOCK
+from .angular_sampling import DenseRows, edge_of, quarter_grid, sample_rows
 from .column_arrays import column_array
 from .elements import Elements
 from .sparse_weights import Normal
@@ -47,7 +48,8 @@ class SparseSettings:
     of the scene's diagonal; neighbours: most of them; normals: distance in radii that opposite normals count as;
     method: how neighbours are weighed; strength: of `sparse_weights.solve`; adding_up: of `Normal.adding_up`, for
     direct light (measured on a ground plane at strength 0.001: none leaves light 4 % too dark, 3 0.7 %, 20 0.5 %);
-    most: share of all elements that may be asked for, dense vertices are left out beyond it; seed: of the random
+    most: share of all elements that may be asked for, dense vertices are left out beyond it; samples_stand: whether
+    samples of sparse vertices stand in the result, False to see what weaving alone does; seed: of the random
     choice."""
 
     dense: float = 0.25
@@ -60,6 +62,7 @@ class SparseSettings:
     strength: float = sparse_weights.STRENGTH
     adding_up: float = 8.0
     most: float = 1.0
+    samples_stand: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -95,31 +98,34 @@ class SparseTransfer:
 
 @dataclass
 class _Scene:
-    """Where receivers are. places (n, 6): position in units of the radius and scaled normal; morton: their order."""
+    """Where receivers are. places (n, 6): position in units of the radius and scaled normal; morton: their order;
+    dense: vertices sampled so far; rows: room for one of each receiver, of which the first len(dense) are filled."""
 
     elements: Elements
     settings: SparseSettings
     places: NDArray[np.float64]
     morton: Places
+    rows: DenseRows
     dense: Places = field(default_factory=lambda: np.zeros(0, np.int64))
-    rows: DenseRows | None = None
 
     @staticmethod
     def of(elements: Elements, positions: NDArray[np.float64], normals: NDArray[np.float64],
-           settings: SparseSettings) -> _Scene:
+           settings: SparseSettings, budget: int | None, folder: Path | None) -> _Scene:
         radius = settings.radius * (bounding_diagonal([positions]) or 1.0)
         # Opposite normals are 2 apart.
         places = np.concatenate([positions / radius, normals * (0.5 * settings.normals)], axis=1)
-        return _Scene(elements, settings, places, morton_order(positions))
+        # Pages of rows that nobody fills are never touched, on the disk neither.
+        size = len(elements), elements.columns, budget, folder
+        rows = DenseRows(column_array(*size), column_array(*size, bool))
+        return _Scene(elements, settings, places, morton_order(positions), rows)
 
-    def add(self, vertices: Places) -> None:
-        """Sample more dense vertices."""
-        rows = dense_rows(self.elements, vertices)
-        self.dense = np.concatenate([self.dense, vertices])
-        if self.rows is not None:
-            rows = DenseRows(np.concatenate([self.rows.values, rows.values]),
-                             np.concatenate([self.rows.features, rows.features]))
-        self.rows = rows
+    def add(self, vertices: Places) -> Iterator[None]:
+        """Sample more dense vertices, block by block."""
+        for start in range(0, len(vertices), BLOCK):
+            block = vertices[start:start + BLOCK]
+            sample_rows(self.elements, block, self.rows, len(self.dense))
+            self.dense = np.concatenate([self.dense, block])
+            yield
 
     def near(self, vertices: Places, count: int) -> tuple[Places, NDArray[np.float64]]:
         """Of each vertex the nearest dense ones (n, count) within the radius, as numbers of rows, and their distances
@@ -134,26 +140,28 @@ def sparse_transfer(elements: Elements, positions: NDArray[np.float64], normals:
                     ) -> Generator[float, None, SparseTransfer]:
     """Yield progress, return the transfer of all receivers at positions (n, 3) with normals (n, 3).
 
-    budget, folder: of `column_array`; beside it the rows of the dense vertices are held, 5 bytes an element. The same
-    seed gives the same result, whatever the threads.
+    budget, folder: of `column_array`, for the result and for the rows of dense vertices, 5 bytes an element of theirs.
+    The same seed gives the same result, whatever the threads.
     """
     settings = settings or SparseSettings()
     edge_of(elements.columns)
-    scene = _Scene.of(elements, positions, normals, settings)
+    scene = _Scene.of(elements, positions, normals, settings, budget, folder)
     asked = elements.asked
     rank = np.ones(len(elements), np.int16)
+    most = max(1.0, settings.dense * len(elements))
     for number in range(settings.rounds):
         chosen = _next_dense(scene, rank, number)
+        for _ in scene.add(chosen):
+            yield 0.5 * min(1.0, len(scene.dense) / most)
         if len(chosen):
-            scene.add(chosen)
             rank = _local_ranks(scene)
-        yield 0.5 * (number + 1) / settings.rounds
-    _add_lonely(scene)
+    for _ in _add_lonely(scene):
+        yield 0.5
     dense_elements = elements.asked - asked
     result = column_array(elements.columns, len(elements), budget, folder)
     for start in range(0, len(scene.dense), VERTICES):
         part = scene.dense[start:start + VERTICES]
-        result[:, part] = (scene.rows.values[start:start + VERTICES] * elements.factor(part)).T
+        result[:, part] = (scene.rows.values[start:start + len(part)] * elements.factor(part)).T
     is_dense = np.zeros(len(elements), bool)
     is_dense[scene.dense] = True
     sparse = scene.morton[~is_dense[scene.morton]]
@@ -197,13 +205,13 @@ def _local_ranks(scene: _Scene) -> NDArray[np.int16]:
     neighbours' first-pass samples; of every other vertex its nearest dense one's."""
     order = np.argsort(np.argsort(scene.morton)[scene.dense])
     found, _ = scene.near(scene.dense, RANK_NEIGHBOURS)
-    samples = scene.rows.values[:, quarter_grid(edge_of(scene.elements.columns))]
+    grid = quarter_grid(edge_of(scene.elements.columns))
     ranks = np.ones(len(scene.dense), np.int16)
     for start in range(0, len(order), GROUP):
         group = order[start:start + GROUP]
         rows, local = _local(found[group])
         gram = np.zeros((len(rows) + 1, len(rows) + 1))
-        block = samples[rows]
+        block = scene.rows.values[rows][:, grid]
         gram[:-1, :-1] = multiply(block, block.T)
         # The empty slot's number is the last row, of zeros.
         values = gram[local[:, :, None], local[:, None, :]]
@@ -226,7 +234,7 @@ def _local(found: Places) -> tuple[Places, Places]:
     return rows, np.where(found >= 0, np.searchsorted(rows, found), len(rows))
 
 
-def _add_lonely(scene: _Scene) -> None:
+def _add_lonely(scene: _Scene) -> Iterator[None]:
     """Sample vertices without any dense neighbour as dense ones: nothing could be woven from nothing."""
     free = np.ones(len(scene.elements), bool)
     free[scene.dense] = False
@@ -236,7 +244,7 @@ def _add_lonely(scene: _Scene) -> None:
         if not len(lonely):
             return
         # One in several, since lonely vertices may be each other's neighbours.
-        scene.add(lonely[::4])
+        yield from scene.add(lonely[::4])
         vertices = np.setdiff1d(lonely, lonely[::4])
 
 
@@ -265,7 +273,7 @@ def _reconstruct(scene: _Scene, vertices: Places) -> tuple[Single, int]:
         multiply(np.ascontiguousarray(spread[:, :-1]), scene.rows.values[rows], out=values[part])
     np.clip(values, 0.0, elements.highest, out=values)
     row, place = np.nonzero(worth)
-    if settings.method != "radius":
+    if settings.method != "radius" and settings.samples_stand:
         values[row, chosen[row, place]] = samples[row, place]
     return values, int(np.count_nonzero(found >= 0))
 

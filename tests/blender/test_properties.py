@@ -21,7 +21,7 @@ if "prt" not in sys.modules:  # the checkout as a package, as tools/prt.py loads
 
 # Of the preview alone, or turned into a field of another name.
 NO_FIELDS = {"preset", "exposure", "window", "cloud_collection", "targets", "target_collection",
-              "compare_samples", "compare_percentage", "display", "show_cloud"}
+              "compare_samples", "compare_percentage", "display", "show_cloud", "lamps_by_directions"}
 
 
 @pytest.fixture
@@ -69,7 +69,8 @@ def test_a_chosen_preset_changes_nothing_of_itself(settings: bpy.types.PropertyG
     ("error_receivers", 7, "error_receivers", 7), ("error_paths", 100, "error_paths", 100),
     ("surface_patches", 77, "surface_patches", 77), ("cloud_emission", 3, "cloud_emission", 3),
     ("lamp_basis", "cloud", "lamp_basis", "cloud"), ("distant_basis", "cubemap", "distant_basis", "cubemap"),
-    ("cubemap_size", 8, "cubemap_size", 8), ("memory_budget", 0.5, "memory_budget", 0.5),
+    ("cubemap_size", 8, "cubemap_size", 8), ("sampling", "sparse", "sampling", "sparse"),
+    ("memory_budget", 0.5, "memory_budget", 0.5),
     ("encoder", "eigentransport", "encoder", "eigentransport")])
 @pytest.mark.parametrize("preset", ["draft", "standard", "high"])
 def test_each_control_changes_its_setting_and_no_other(preset: str, name: str, value: object, field: str,
@@ -147,7 +148,7 @@ class Drawn:
 
 @pytest.mark.parametrize(("lighting", "basis"), [("environment", None), ("local", "cloud"), ("both", "surfaces")])
 def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: bpy.types.PropertyGroup) -> None:
-    from prt.panels import bake, check, preview
+    from prt.panels import bake, check, live_materials, preview
     from prt.panels import settings as expert
 
     settings.lighting, settings.targets = lighting, "collection"
@@ -158,12 +159,15 @@ def test_panels_draw_every_setting(lighting: str, basis: str | None, settings: b
                                     selected_objects=[], region=types.SimpleNamespace(width=300),
                                     preferences=types.SimpleNamespace(system=types.SimpleNamespace(ui_scale=1.0)))
     panels = (bake.PRT_PT_bake, expert.PRT_PT_rays, expert.PRT_PT_highlights, expert.PRT_PT_local_lights,
-              expert.PRT_PT_compression, preview.PRT_PT_preview, check.PRT_PT_check)
-    for sky, panel in itertools.product(("cubemap", "sh"), panels):
+              expert.PRT_PT_compression, live_materials.PRT_PT_live_materials, preview.PRT_PT_preview,
+              check.PRT_PT_check)
+    for sky, panel in itertools.product(("cubemap", "sh", "auto"), panels):
         settings.distant_basis = sky
         if "poll" not in vars(panel) or panel.poll(context):
             drawing = types.SimpleNamespace(layout=Drawn(found))
             drawing.column = lambda context, panel=panel, drawing=drawing: panel.column(drawing, context)
+            if "draw_header" in vars(panel):
+                panel.draw_header(drawing, context)
             panel.draw(drawing, context)
     lamps = {"lamp_basis", "cloud_region", "cloud_collection", "cloud_lights", "cloud_spacing"}
     own = {"cloud": {"merge_response", "zone_receivers", "cloud_emission"},

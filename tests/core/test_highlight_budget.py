@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from prt_addon.baking.distant_basis import DistantBasis
 from prt_addon.baking.highlight_budget import VIEWS, Measurement, measure
 from prt_addon.baking.highlight_reference import ALL_HITS, TrueSurfaces
 from prt_addon.baking.highlight_sampling import TrueHighlight, cosine_directions, even_directions, lattice
@@ -144,7 +145,7 @@ def measured_highlights(light, material=GOLD):
     frames = surface_frames(scene.normals[keys], scene.tangents[keys])
     views = cosine_directions(lattice(len(keys), VIEWS, np.random.Generator(np.random.PCG64(2)))).reshape(-1, VIEWS, 3)
     surfaces = TrueSurfaces.of(tracer, scene, plan, scene.albedo)
-    task = Measurement(surfaces, receivers, frames, views, light, 5, -1, (0, ALL_HITS), 4096, 4)
+    task = Measurement(surfaces, receivers, frames, views, light, DistantBasis(5), -1, (0, ALL_HITS), 4096, 4)
     return drain(measure(task, scene.material[keys])).full
 
 

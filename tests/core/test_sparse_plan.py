@@ -24,7 +24,7 @@ def test_the_cost_of_an_element_is_measured():
     slow = Slow(np.zeros((400, 96), np.float32))
     cost = element_seconds(slow)
     assert 20e-6 <= cost < 40e-6
-    assert slow.asked == 400 * 16
+    assert slow.asked == 3 * 400 * 16
     assert element_seconds(MatrixElements(np.zeros((400, 96), np.float32))) < 1e-6
     assert element_seconds(MatrixElements(np.zeros((0, 96), np.float32))) == 0.0
     assert element_seconds(Slow(np.zeros((1, 6), np.float32))) > 0.0
@@ -40,5 +40,5 @@ def test_slow_elements_pay_and_rays_do_not():
 
 
 def test_break_even_is_where_both_take_as_long():
-    found = plan(1000, 96, break_even())
+    found = plan(1000, 96, break_even(96))
     assert found.all_seconds == pytest.approx(found.sparse_seconds)

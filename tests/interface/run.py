@@ -40,6 +40,8 @@ SCRIPTS = {
     "views": ("views_in_blender.py", "make_views.py"),
     "changes": ("changes_in_blender.py", "make_views.py"),
     "display": ("display_in_blender.py", "make_display.py"),
+    "sky": ("sky_in_blender.py", "make_display.py"),
+    "editing": ("editing_in_blender.py", "make_editing.py"),
 }
 RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
@@ -257,10 +259,11 @@ def main() -> int:
         blender = Blender(arguments.ui, arguments.headless, output, Path(resources))
         outcomes = [run_check(check_install, blender, arguments.zip.resolve())]
         if arguments.only in (None, "commands"):
-            scene = make_scene(blender, "make_scene.py", outcomes)
-            outcomes += [run_check(check, blender, scene)
-                         for check in (check_bad_arguments, check_command_bake, check_interrupt)]
-            outcomes.append(run_check(check_kill_among_lamps, blender, make_scene(blender, "make_room.py", outcomes)))
+            with blender.apart() as own:
+                scene = make_scene(own, "make_scene.py", outcomes)
+                outcomes += [run_check(check, own, scene)
+                             for check in (check_bad_arguments, check_command_bake, check_interrupt)]
+                outcomes.append(run_check(check_kill_among_lamps, own, make_scene(own, "make_room.py", outcomes)))
         for name, (script, maker) in SCRIPTS.items():
             if arguments.only in (None, name):
                 with blender.apart() as own:
