@@ -37,8 +37,9 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         bounced.prop(settings, "gather_directions")
         bounced.prop(settings, "bounce_error")
         column.prop(settings, "receivers")
-        if settings.receivers != "vertices":
-            column.prop(settings, "atlas_size")
+        texels = column.column()
+        texels.active = settings.receivers != "vertices"
+        texels.prop(settings, "atlas_size")
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
