@@ -143,7 +143,7 @@ class BakeSettings:
     merge_response: float = 0.05
     merged_response: str = "arithmetic"
     live_editing: bool = False
-    live_entries: int = 96
+    live_entries: int = 64
     threads: int = 0
     seed: int = 1
 

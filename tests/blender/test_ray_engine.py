@@ -14,6 +14,7 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 
 # isort: split
 from prt.prt_addon.errors import PRTError
+from prt.prt_addon.scene.texel_surface import TracedSurface
 from prt.prt_addon.tracing.mixed_tracer import LEAST_RAYS, MixedTracer
 from prt.prt_addon.tracing.ray_calibration import ball_field, calibrate, field_rays
 from prt.prt_addon.tracing.ray_cost import choose_tracer
@@ -222,21 +223,40 @@ def test_both_sides_share_the_work_and_keep_its_order(device):
 
     def work(k: int) -> np.ndarray:
         wheres.append(threading.get_ident())
-        part = slice(4096 * k, 4096 * (k + 1))
-        return mixed.occluded(origins[part], directions[:1])
+        return mixed.occluded_where(origins[4096 * k:4096 * (k + 1)], directions[:1], np.ones((1, 4096), bool))[0]
     found = list(mixed.map_in_order(work, range(8)))
     assert [k for k, _ in found] == list(range(8))
     assert (np.concatenate([hit for _, hit in found]) != alone.occluded(origins, directions[:1])).sum() <= 2
     assert len(set(wheres)) == 2 and 0 < mixed.gpu_rays < len(origins)
     assert mixed.gpu_rays == 4096 * wheres.count(threading.get_ident())
-    few = mixed.gpu_rays
-    mixed.nearest(origins[:LEAST_RAYS - 1], directions[:1])  # not worth a dispatch
-    assert mixed.gpu_rays == few and mixed.facts["gpu_rays"] == few
+    known = mixed.gpu_rays
+    few = np.ones((1, LEAST_RAYS - 1), bool)
+    mixed.occluded_where(origins[:LEAST_RAYS - 1], directions[:1], few)  # not worth a dispatch
+    mixed.nearest(origins, directions[:1])  # sent one by one Embree is faster
+    assert mixed.gpu_rays == known and mixed.facts["gpu_rays"] == known
+    which, row, hits = mixed.nearest_where(origins[:3000], directions[:2], np.ones((2, 3000), bool))
+    assert mixed.gpu_rays == known + 6000 and np.array_equal(which * 3000 + row, np.arange(6000))
+    assert_agree(hits, alone.nearest(origins[row], directions[which]), 2)
     closed = mixed.map_in_order(work, range(1000))
     next(closed)
     before = len(wheres)
     closed.close()
     assert len(wheres) <= before + 8
+
+
+def test_hits_on_texels_are_named_as_embrees(device):
+    """Triangles of the traced surface that stand for others of the scene (prt_addon/scene/texel_surface.py)."""
+    points, triangles = ball_field()
+    surface = TracedSurface(points.astype(np.float64), triangles, np.array([0, len(triangles)]),
+                            np.array([100, len(triangles) + 100]), (None,))
+    mixed, alone = MixedTracer(points, triangles, 1, device, surface), Tracer(points, triangles, 1, surface)
+    origins, directions = field_rays(points)
+    asked = np.ones((2, 2000), bool)
+    *_, ours = mixed.nearest_where(alone.to_tracing_space(origins[:2000]), directions[:2], asked)
+    *_, theirs = alone.nearest_where(alone.to_tracing_space(origins[:2000]), directions[:2], asked)
+    assert mixed.gpu_rays == 4000 and ours.traced is not None and theirs.triangle.max() >= 100
+    assert_agree(ours, theirs, 2)
+    assert (ours.traced[0] != theirs.traced[0]).sum() <= 2
 
 
 def test_errors_of_work_come_out(device):
