@@ -132,10 +132,14 @@ def main() -> None:
         """Seconds that one of the parts that follow may take."""
         return max(0.0, arguments.seconds - (time.perf_counter() - began)) * share
 
-    def no_embree(*_: Any) -> Any:
-        return lambda *_: time.sleep(0.001)
+    def embree_of(points: NDArray[np.float32], triangles: NDArray[np.int32]) -> Any:
+        if embrees[scenes[0].name] is None:
+            return lambda *_: time.sleep(1.0)
+        traced = Embree(points, triangles)
+        return lambda origins, directions: traced.occluded_where(
+            origins, directions, np.ones((len(directions), len(origins)), bool))
     print(f"device: {device.name}, {device.version}; {threads} CPU threads")
-    known = calibrate(device, (lambda p, t: Embree(p, t).occluded) if embrees[scenes[0].name] else no_embree, threads)
+    known = calibrate(device, embree_of, threads)
     print_table("Calibration", ["constant", "value"], [[k, v] for k, v in asdict(known).items()])
     results["calibration"] = asdict(known)
     engines = {}

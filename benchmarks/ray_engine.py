@@ -17,11 +17,13 @@ import sys
 import types
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from common import ROOT, print_table
+from numpy.typing import NDArray
 from ray_measurements import (
     MODEL_HEADER,
     RATES_HEADER,
@@ -89,7 +91,12 @@ def main() -> None:
     prepare_gpu()
     device = BlenderDevice()
     print(f"{device.name}, Embree on {arguments.threads} threads\n")
-    known = calibrate(device, lambda p, t: Embree(p, t, arguments.threads).occluded, arguments.threads)
+
+    def embree_of(points: NDArray[np.float32], triangles: NDArray[np.int32]) -> Any:
+        traced = Embree(points, triangles, arguments.threads)
+        return lambda origins, directions: traced.occluded_where(
+            origins, directions, np.ones((len(directions), len(origins)), bool))
+    known = calibrate(device, embree_of, arguments.threads)
     print_table(["constant", "value"], [[k, v] for k, v in asdict(known).items()])
     made = scenes()
     engines = {name: RayEngine(device, scene.points, scene.triangles) for name, scene in made.items()}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from prt_addon.tracing.hits import Hits
 from prt_addon.tracing.ray_buckets import make_buckets, pair_with_cells
-from prt_addon.tracing.ray_calibration import all_pairs_run, traversal_seconds
+from prt_addon.tracing.ray_calibration import all_pairs_run, pairs_seconds, traversal_seconds
 from prt_addon.tracing.ray_cost import Calibration, gpu_share
 from prt_addon.tracing.ray_engine import FARTHEST, MOST_RAYS, RayEngine
 
@@ -69,6 +69,40 @@ class Embree:
             return self.scene.run(np.ascontiguousarray(origins[part]), np.ascontiguousarray(given),
                                   query="OCCLUDED") >= 0
         return np.concatenate(self._parts(trace, len(origins)))
+
+
+    def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                       asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """As the bake's shadow rays: one direction after the other, in threads."""
+        found = np.zeros(asked.shape, bool)
+
+        def trace(k: int) -> None:
+            chosen = np.flatnonzero(asked[k])
+            found[k, chosen] = self.scene.run(np.take(origins, chosen, axis=0), directions[k:k + 1],
+                                              query="OCCLUDED") >= 0
+        list(self._pool.map(trace, range(len(directions))))
+        return found
+
+    def nearest_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                      asked: NDArray[np.bool_]) -> Hits:
+        """As the bake's gather rays."""
+        which, row = np.nonzero(asked)
+        return self.nearest(np.take(origins, row, axis=0), np.take(directions, which, axis=0))
+
+
+def block_of_rays(scene: Scene, count: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Directions (d, 3) over the sphere, and which origins face each (d, r): about `count` rays, as a bake has them."""
+    directions = np.random.default_rng(seed).normal(size=(max(1, 2 * count // len(scene.origins)), 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    return directions, np.stack([(scene.normals * direction).sum(axis=1) > 0.0 for direction in directions])
+
+
+def gpu_where(engine: RayEngine, query: str, scene: Scene, directions: NDArray[np.float32],
+              asked: NDArray[np.bool_]) -> Any:
+    """What MixedTracer.occluded_where and nearest_where do."""
+    if query == "nearest":
+        return engine.nearest_pairs(scene.origins, directions, np.flatnonzero(asked))
+    return engine.occluded_where(scene.origins, directions, asked)
 
 
 def make_rays(scene: Scene, kind: str, count: int, seed: int) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
@@ -133,7 +167,14 @@ def edge_and_cosine(scene: Scene, triangle: NDArray[np.integer], origins: NDArra
 def add_agreement(total: Agreement, scene: Scene, engine: RayEngine, embree: Embree, origins: NDArray[np.float32],
                   directions: NDArray[np.float32], trace: Callable[..., Hits] | None = None) -> None:
     """Trace a batch by both and add what agrees."""
-    ours, theirs = (trace or engine.nearest)(origins, directions), embree.nearest(origins, directions)
+    if trace is None and len(directions) == 1:  # rays of one direction go as pairs
+        codes = np.arange(len(origins))
+        ours = engine.nearest_pairs(origins, directions, codes)
+        occluded = engine.occluded_where(origins, directions, np.ones((1, len(origins)), bool))[0]
+    else:
+        ours = (trace or engine.nearest)(origins, directions)
+        occluded = ours.triangle >= 0 if trace else engine.occluded(origins, directions)
+    theirs = embree.nearest(origins, directions)
     total.rays += len(origins)
     total.embree_misses += int((theirs.triangle < 0).sum())
     total.gpu_misses += int((ours.triangle < 0).sum())
@@ -161,8 +202,7 @@ def add_agreement(total: Agreement, scene: Scene, engine: RayEngine, embree: Emb
         total.place += int((place & ~edge).sum())
         total.grazing += int((grazing & ~edge & ~place).sum())
         total.other += int((~grazing & ~edge & ~place).sum())
-    if trace is None:
-        total.occlusion += int((engine.occluded(origins, directions) != (ours.triangle >= 0)).sum())
+    total.occlusion += int((occluded != (ours.triangle >= 0)).sum())
 
 
 def agreement(scene: Scene, engine: RayEngine, embree: Embree, count: int, seconds: float = 1e9) -> Agreement:
@@ -177,24 +217,31 @@ def agreement(scene: Scene, engine: RayEngine, embree: Embree, count: int, secon
 
 
 def rates(scene: Scene, engine: RayEngine, embree: Embree | None, count: int) -> list[list[Any]]:
-    """Rows as RATES_HEADER says; the kernel alone with the first batch of rays."""
+    """Rows as RATES_HEADER says. "block": rays as a bake has them, many directions from each origin; "single": every
+    ray sent with an origin and a direction of its own."""
     rows = []
-    for kind, query in (("parallel", "occluded"), ("parallel", "nearest"), ("gather", "occluded"),
-                        ("gather", "nearest")):
-        batches = make_rays(scene, kind, count, 7)
-        rays = sum(len(origins) for origins, _ in batches)
-        gpu = rays / best_seconds(lambda q=query, b=batches: [getattr(engine, q)(*batch) for batch in b])
-        cpu = np.nan
-        if embree is not None:
-            cpu = rays / best_seconds(lambda q=query, b=batches: [getattr(embree, q)(*batch) for batch in b])
-        origins, directions = batches[0][0][:MOST_RAYS // 8], batches[0][1][:MOST_RAYS // 8]
-        alone = len(origins) / traversal_seconds(engine, origins, directions, query == "occluded")
-        rows.append([scene.name, kind, query, alone / 1e6, gpu / 1e6, cpu / 1e6, gpu / cpu])
+    directions, asked = block_of_rays(scene, count, 5)
+    rays = int(np.count_nonzero(asked))
+    for query in ("occluded", "nearest"):
+        alone = rays / pairs_seconds(engine, scene.origins, directions, asked, query == "occluded")
+        gpu = rays / best_seconds(lambda q=query: gpu_where(engine, q, scene, directions, asked))
+        cpu = np.nan if embree is None else rays / best_seconds(
+            lambda q=query: getattr(embree, f"{q}_where")(scene.origins, directions, asked))
+        rows.append([scene.name, "block", query, rays, alone / 1e6, gpu / 1e6, cpu / 1e6, gpu / cpu])
+    batches = make_rays(scene, "gather", count, 7)
+    rays = sum(len(origins) for origins, _ in batches)
+    origins, given = batches[0][0][:MOST_RAYS], batches[0][1][:MOST_RAYS]
+    for query in ("occluded", "nearest"):
+        alone = len(origins) / traversal_seconds(engine, origins, given, query == "occluded")
+        gpu = rays / best_seconds(lambda q=query: [getattr(engine, q)(*batch) for batch in batches])
+        cpu = np.nan if embree is None else rays / best_seconds(
+            lambda q=query: [getattr(embree, q)(*batch) for batch in batches])
+        rows.append([scene.name, "single", query, rays, alone / 1e6, gpu / 1e6, cpu / 1e6, gpu / cpu])
     return rows
 
 
-RATES_HEADER = ["scene", "rays", "query", "GPU kernel alone, Mray/s", "GPU with transfers, Mray/s", "Embree Mray/s",
-                "factor with transfers"]
+RATES_HEADER = ["scene", "rays", "query", "number", "GPU kernel alone, Mray/s", "GPU with transfers, Mray/s",
+                "Embree Mray/s", "factor with transfers"]
 
 
 def best_seconds(work: Callable[[], Any], runs: int = 2) -> float:
@@ -210,8 +257,8 @@ def best_seconds(work: Callable[[], Any], runs: int = 2) -> float:
 
 def model_rows(engine: RayEngine, known: Calibration, bucket_rays: list[int], triangles: list[int],
                ) -> list[list[Any]]:
-    """Rows (R, T, measured ms, equation 11 in ms, with latency and upload in ms, measured tests/s, modelled tests/s):
-    all pairs of R rays and T triangles in one dispatch, rays sent before, answers read back (the paper's Figure 7).
+    """Rows as MODEL_HEADER says, of all pairs of R rays and T triangles in one dispatch, rays sent before, answers read
+    back (the paper's Figure 7).
     What would take longer than LONGEST is left out: a driver may take it for a hang."""
     rows = []
     for rays in bucket_rays:
@@ -224,16 +271,14 @@ def model_rows(engine: RayEngine, known: Calibration, bucket_rays: list[int], tr
                 run()
                 engine.device.read(answers)
             took = best_seconds(work, 5)
-            # Whole rows of a texture come back, however few rays there are.
-            published, rest = known.published(rays, count), known.latency
-            tests = rays * count
-            rows.append([rays, count, 1e3 * took, 1e3 * published, 1e3 * (published + rest), tests / took / 1e6,
-                         tests / published / 1e6, tests / (published + rest) / 1e6])
+            published, ours, tests = known.published(rays, count), known.on_device(rays, count), rays * count
+            rows.append([rays, count, 1e3 * took, 1e3 * published, 1e3 * ours, tests / took / 1e6,
+                         tests / published / 1e6, tests / ours / 1e6])
     return rows
 
 
-MODEL_HEADER = ["R", "T", "measured ms", "eq. 11 ms", "+ latency ms", "measured Mtests/s", "eq. 11 Mtests/s",
-                "+ latency Mtests/s"]
+MODEL_HEADER = ["R", "T", "measured ms", "eq. 11 ms", "with latency and step, ms", "measured Mtests/s",
+                "eq. 11 Mtests/s", "with latency and step, Mtests/s"]
 
 
 def sweep(scene: Scene, engine: RayEngine, known: Calibration, kind: str, count: int, bucket_rays: list[int],

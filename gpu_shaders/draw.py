@@ -21,6 +21,7 @@ from . import image_textures, programs, texel_programs
 from .image_textures import TexturedVertices, textured_vertices
 from .render_data import (
     DrawItem,
+    LampScattering,
     RenderData,
     clip_transform,
     constant_texels,
@@ -32,20 +33,10 @@ from .render_data import (
     texture_values,
     viewer_of,
 )
+from .scattering import ScatteringPasses, bounced_texture
+from .textures import make_texture, read_texture
 
 STALE_DIMMING = 0.3  # factor on a stale object's radiance
-
-
-def make_texture(texels: NDArray[np.float32]) -> gpu.types.GPUTexture:
-    """An RGBA32F texture of (height, width, 4) values."""
-    height, width, _ = texels.shape
-    buffer = gpu.types.Buffer("FLOAT", texels.size, np.ascontiguousarray(texels, np.float32).reshape(-1))
-    return gpu.types.GPUTexture((width, height), format="RGBA32F", data=buffer)
-
-
-def read_texture(texture: gpu.types.GPUTexture) -> NDArray[np.float32]:
-    """The values of an RGBA32F texture, (height, width, 4); row 0 is the texture's first, the lowest of a picture."""
-    return np.array(texture.read(), np.float32).reshape(texture.height, texture.width, 4)
 
 
 class ObjectDrawing:
@@ -64,6 +55,8 @@ class ObjectDrawing:
         self._plain_batch: gpu.types.GPUBatch | None = None  # for colours, one vertex per point
         self._direct: gpu.types.GPUTexture | None = None
         self._direct_values: NDArray[np.float32] | None = None
+        self._scattering: LampScattering | None = None
+        self._passes: ScatteringPasses | None = None
 
     def relight(self, constants: NDArray[np.float32]) -> None:
         """Compute every point's exit radiance from per-cluster constants (clusters, vectors + 1, rows, 3)."""
@@ -91,15 +84,32 @@ class ObjectDrawing:
             plain = plain_surface(self.data)
             self._plain_batch = _make_batch(_make_vertices(plain), plain.triangles)
 
-    def add_direct(self, values: NDArray[np.float32] | None) -> None:
+    def add_direct(self, values: NDArray[np.float32] | None, scattering: LampScattering | None = None) -> None:
         """Direct light (points, rows, 3), for unit albedo in row 0, to add from now on; None for none."""
-        if values is self._direct_values:
+        if values is self._direct_values and scattering is self._scattering:
             return
         expected = (self.data.points, self.data.rows, 3)
         if values is not None and values.shape != expected:
             raise ValueError(f"direct light has shape {values.shape}, the drawn data needs {expected}")
-        self._direct_values = values
+        self._direct_values, self._scattering = values, scattering
         self._direct = None if values is None else make_texture(texture_values(values.reshape(-1, 3)))
+        if self._direct is not None and scattering is not None:
+            self._scatter(scattering)
+
+    def _scatter(self, scattering: LampScattering) -> None:
+        """Take the direct light through the body here, or find out once how long that would take."""
+        live, data = scattering.live, self.data
+        if not scattering.on_card and live.card_seconds is not None:
+            return
+        if self._passes is None or self._passes.live is not live:
+            self._passes = ScatteringPasses(live)
+        if scattering.on_card:
+            bounced = None if scattering.bounced is None else bounced_texture(scattering.bounced)
+            self._direct = self._passes.run(self._direct, bounced, data.points, data.rows)
+        else:
+            live.card_seconds = self._passes.seconds(data.points, data.rows)
+            if live.card_seconds >= live.seconds:
+                self._passes = None  # the processor will go on
 
     def show_textures(self, textures: SurfaceTextures | None) -> None:
         """Take the albedo from images from now on; None for that of the points."""
@@ -254,7 +264,7 @@ class DrawingCache:
             else:
                 drawing.show_colours(heat_colours(item.heat) if item.colours is None else item.colours.values)
             self._lights[item.key] = light
-        drawing.add_direct(item.direct)
+        drawing.add_direct(item.direct, item.scattering)
         drawing.show_textures(item.textures)
         return drawing
 

@@ -3,6 +3,9 @@
 //
 // ray_origins:       per ray its origin and its reach
 // ray_directions:    per ray its direction; the first for all where direction_step is 0
+// pair_codes:        with PAIRS, which rays are asked for among all pairs of directions and origins: four to a texel,
+//                    direction * origins + origin
+// asked_bits:        with MASKED, the same as one bit for each pair from `first` on, packed as answers are
 // node_values:       per inner node the boxes and places of its two children
 // triangle_values:   per triangle its corners
 // Far ends of boxes grow by three roundings (Ize 2013, Robust BVH Ray Traversal), so no box is missed by rounding.
@@ -84,9 +87,25 @@ void main()
 {
   int ray = int(gl_GlobalInvocationID.x);
   NearestHit hit = NearestHit(0.0, 0.0, 0.0, 0.0);
-  if (ray < rays) {
+  bool asked = ray < rays;
+#ifdef MASKED
+  if (asked) {
+    uint bits = uint(texelFetch(asked_bits, texel(ray / 64), 0)[(ray % 64) / 16]);
+    asked = ((bits >> uint(ray % 16)) & 1u) != 0u;
+  }
+#endif
+  if (asked) {
+#if defined(MASKED)
+    vec4 origin = texelFetch(ray_origins, texel((first + ray) % origins), 0);
+    vec3 direction = texelFetch(ray_directions, texel((first + ray) / origins), 0).xyz;
+#elif defined(PAIRS)
+    int code = int(texelFetch(pair_codes, texel(ray / 4), 0)[ray % 4]);
+    vec4 origin = texelFetch(ray_origins, texel(code % origins), 0);
+    vec3 direction = texelFetch(ray_directions, texel(code / origins), 0).xyz;
+#else
     vec4 origin = texelFetch(ray_origins, texel(ray), 0);
     vec3 direction = texelFetch(ray_directions, texel(ray * direction_step), 0).xyz;
+#endif
     hit = walk(origin.xyz, direction, origin.w);
   }
   write_answer(ray, hit);

@@ -20,6 +20,7 @@ from ..prt_addon.relighting.texel_light import corner_albedo
 from . import hemisphere_glsl
 
 if TYPE_CHECKING:
+    from ..prt_addon.relighting.live_scattering import LiveScattering
     from ..prt_addon.scene.surface_textures import SurfaceTextures
     from ..prt_addon.scene.texel_surface import TexelSurface
     from ..prt_addon.storage.container import BakedTransfer
@@ -44,6 +45,7 @@ class DrawItem:
     direct: (points, rows, 3) float32, what lamps add to the exit radiance: their direct light, which no bake holds.
         Never changed in place: another array means other light.
     exposure: factor on the radiance. stale: drawn dimmed, because the object was edited after its bake.
+    scattering: what takes the lamps' light through the body, where the bake has links for it. Never changed in place.
     heat: (points,) in 0..1 shown as false colours in place of the radiance, or None.
     colours: false colours that are no heat, or None. textures: images that replace the albedo of points, or None.
     """
@@ -58,11 +60,22 @@ class DrawItem:
     direct: NDArray[np.float32] | None = None
     colours: FalseColours | None = None
     textures: SurfaceTextures | None = None
+    scattering: LampScattering | None = None
 
     @property
     def is_lit(self) -> bool:
         """Whether light is shown, not false colours."""
         return self.heat is None and self.colours is None
+
+
+@dataclass(frozen=True, eq=False)
+class LampScattering:
+    """live: of the bake; bounced: (points, 3) E / pi of lamps by way of the scene, or None; on_card: whether `direct`
+    is still to be taken through the body, by the graphics card; else that was done, and the card is only timed."""
+
+    live: LiveScattering
+    bounced: NDArray[np.float32] | None = None
+    on_card: bool = False
 
 
 @dataclass(frozen=True, eq=False)

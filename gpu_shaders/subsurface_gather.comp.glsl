@@ -24,7 +24,6 @@ void main()
       for (int axis = 0; axis < 3; axis++) {
         light += shift[axis] * texelFetch(pyramid_values, texel(node + 1 + axis), 0).rgb;
       }
-      light = max(light, vec3(0.0));
     }
 #endif
     sum += vec3(red_green, blue_x.x) * light;

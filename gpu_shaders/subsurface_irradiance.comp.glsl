@@ -3,7 +3,7 @@
 //
 // place_values:    per texel of level 0 the number of its receiver (-1: no surface), the share of the light that enters
 //                  (Fresnel's and the layers' transmission), and its area
-// direct_values:   texel receiver * rows, light of lamps; bounced_values: the same of what the scene sends back
+// direct_values:   texel receiver * rows, light of lamps; bounced_values: texel receiver, what the scene sends back
 // pyramid_values:  irradiance, and the area in the fourth number, of which the levels above are made
 void main()
 {
@@ -14,8 +14,10 @@ void main()
   vec4 own = texelFetch(place_values, texel(place), 0);
   vec4 value = vec4(0.0, 0.0, 0.0, own.z);
   if (own.x >= 0.0) {
-    ivec2 lit = texel(int(own.x) * rows);
-    value.rgb = own.y * (texelFetch(direct_values, lit, 0).rgb + bounced_share * texelFetch(bounced_values, lit, 0).rgb);
+    int receiver = int(own.x);
+    value.rgb = texelFetch(direct_values, texel(receiver * rows), 0).rgb;
+    value.rgb += bounced_share * texelFetch(bounced_values, texel(receiver), 0).rgb;
+    value.rgb *= own.y;
   }
   imageStore(pyramid_values, texel(NODE_TEXELS * place), value);
 }

@@ -74,12 +74,10 @@ def measure(job: Path) -> int:
 
     def embree(points: Any, triangles: Any) -> Callable[[Any, Any], Any]:
         made.append(tracer.Tracer(points, triangles))
-        origins_at_once = 4096
 
-        def trace(origins: Any, direction: Any) -> None:
-            starts = range(0, len(origins), origins_at_once)
-            for _ in made[0].map_in_order(lambda start: made[0].occluded(origins[start:start + origins_at_once],
-                                                                         direction), starts):
+        def trace(origins: Any, directions: Any) -> None:
+            for _ in made[0].map_in_order(lambda k: made[0].occluded(origins, directions[k:k + 1]),
+                                          range(len(directions))):
                 pass
         return trace
     found = calibration.calibrate(make_device(), embree, tracer.Tracer(*calibration.ball_field()).threads)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..gpu_shaders import viewport
 from ..gpu_shaders.occluders import Occluder
 from ..gpu_shaders.overlay import Marks
-from ..gpu_shaders.render_data import DrawItem, transfer_signature
+from ..gpu_shaders.render_data import DrawItem, LampScattering, transfer_signature
 from ..prt_addon.blender.fingerprint import surroundings
 from ..prt_addon.blender.image_albedo import surface_textures, textures_key
 from ..prt_addon.blender.lights import distant_light
@@ -47,7 +47,7 @@ from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
-from .distant_lamps import DistantLamps
+from .live_bodies import body_lines, lamp_light
 from .live_materials import LiveMaterials
 from .properties import assign, session
 from .scene_lamps import SceneLamps, cloud_key, cloud_lines, lamps_signature, moved_lamps
@@ -80,6 +80,7 @@ class Shown:
     local: NDArray[np.float64] | None = None
     stale: bool = False
     direct: NDArray[np.float32] | None = None
+    scattering: LampScattering | None = None
     moved: NDArray[np.float64] | None = None
     textures: SurfaceTextures | None = None
     textures_key: Hashable = None
@@ -116,7 +117,6 @@ class Live:
     message: str = ""
     light: DistantLight | None = None
     lamps: SceneLamps = field(default_factory=SceneLamps)
-    far_lamps: DistantLamps = field(default_factory=DistantLamps)
     lamps_read: list[LocalLight] = field(default_factory=list)
     lamps_signature: Hashable = None
     lamps_time: float = 0.0
@@ -216,7 +216,7 @@ def draw_list() -> list[DrawItem]:
         key, baked, direct = (shown.key, shown.baked, shown.direct) if edited is None else (
             edited.key, edited.baked, edited.with_direct(shown.direct))
         items.append(DrawItem(key, baked, moved, light, 1.0 if painted else exposure, shown.stale,
-                              direct=direct, colours=painted, textures=shown.textures))
+                              direct=direct, colours=painted, textures=shown.textures, scattering=shown.scattering))
     if len(owners) < len(_live.owners):  # one was renamed or removed, which Blender may not tell
         _live.bakes_dirty = True
         _schedule(SHORTEST_WAIT)
@@ -330,7 +330,6 @@ def _read_bakes() -> None:
     bakes = _bakes_here()
     _live.bakes_dirty, _live.shown, _live.lines, _live.known = False, {}, [], _known(bakes)
     _live.lamps.forget_geometry()
-    _live.far_lamps.forget_geometry()
     layer = {found.name_full for found in bpy.context.view_layer.objects}
     for name, (found, owner, local) in bakes.items():
         line = Line(name)
@@ -403,7 +402,7 @@ def _cloud_lines() -> list[str]:
         if len(owners) > 1:
             lines.append(f"{names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}:")
         lines += cloud_lines(_live.shown[names[0]].baked.cloud).splitlines()
-    return lines
+    return lines + body_lines(_live.lamps, _live.shown)
 
 
 def _errors_of(baked: BakedTransfer) -> tuple[float, ...]:
@@ -436,7 +435,6 @@ def _read_stale() -> None:
     if around != _live.around:
         _live.around = around
         _live.lamps.forget_geometry()
-        _live.far_lamps.forget_geometry()
         _live.materials.forget_geometry()
         _live.materials_dirty = True
     bakes, changed = _bakes_here(), False
@@ -493,11 +491,12 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     _live.lamps_time = now
     _note_moves(lamps, now)
     signature = lamps_signature(lamps), frozenset(_live.moving)
-    if signature != _live.lamps_signature or any(
+    fading = not _live.lamps.settled and any(shown.baked.links is not None for shown in _live.shown.values())
+    if fading or signature != _live.lamps_signature or any(
             shown.direct is None and shown.baked.cloud is not None for shown in _live.shown.values()):
         _live.lamps_signature = signature
         for name, shown in _live.shown.items():
-            shown.direct = _live.lamps.direct(name, shown.baked, lamps, _live.moving, shown.moved)
+            shown.direct, shown.scattering = lamp_light(_live.lamps, name, shown, lamps, _live.moving)
         _live.materials_dirty = True
         viewport.redraw()
     if not _live.lamps.settled:
@@ -511,10 +510,10 @@ def _read_far_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None
     bakes = {name: shown.baked for name, shown in _live.shown.items() if shown.baked.cloud is None}
     if settings.lamps_by_directions and bakes:
         owners = {name: _live.shown[name].owner for name in bakes}
-        outside = _live.far_lamps.step(bakes, depsgraph, warnings, owners)
+        outside = _live.lamps.far.step(bakes, depsgraph, warnings, owners)
     for name, baked in bakes.items():
         shown = _live.shown[name]
-        direct = _live.far_lamps.direct(name, baked, outside, settings.window, shown.moved)
+        direct = _live.lamps.far.direct(name, baked, outside, settings.window, shown.moved)
         if direct is not shown.direct:
             shown.direct = direct
             viewport.redraw()

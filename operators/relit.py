@@ -20,7 +20,6 @@ from ..prt_addon.relighting.exit_radiance import view_radiance
 from ..prt_addon.relighting.moved_light import distant_light_in, moved_normals, moved_points
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
-from .distant_lamps import DistantLamps
 from .scene_lamps import SceneLamps
 
 
@@ -74,16 +73,14 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
     moved = {name: transform_since_bake(found, baked[name].header) for name, found in zip(baked, objects, strict=True)}
     scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
-    far, outside = DistantLamps(), []
-    if by_directions and use_scene_lights:
-        outside = far.step(baked, depsgraph, warnings)
+    outside = scene_lamps.far.step(baked, depsgraph, warnings) if by_directions and use_scene_lights else []
     light, direct = {}, {}
     for name, b in baked.items():
         seen = distant_light_in(distant, b.lighting_basis, moved[name])
         light[name] = joined_light(b.lighting_basis, seen, scene_lamps.cloud_light(b, moved[name]) if lamps else None)
         direct[name] = scene_lamps.direct(name, b, lamps, moved=moved[name]) if lamps else None
         if outside and b.cloud is None:
-            direct[name] = far.direct(name, b, outside, window, moved[name])
+            direct[name] = scene_lamps.far.direct(name, b, outside, window, moved[name])
     return Lit(light, direct, moved, tuple(dict.fromkeys(warnings)))
 
 

@@ -33,6 +33,7 @@ from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.digests import digest_arrays
 from ..prt_addon.tracing.tracer import Tracer
+from .distant_lamps import DistantLamps
 
 Move = NDArray[np.float64] | None
 Moves = Mapping[str, NDArray[np.float64]]
@@ -52,6 +53,7 @@ class SceneLamps:
     _direct: dict[tuple[str, bytes], DirectLight] = field(default_factory=dict)
     _scattering: dict[str, tuple[BakedTransfer, LiveScattering]] = field(default_factory=dict)  # by object
     _keys: dict[int, tuple[LocalBasis, str]] = field(default_factory=dict)  # by the cloud's identity
+    far: DistantLamps = field(default_factory=DistantLamps)  # of bakes without columns for lamps
 
     def forget_geometry(self) -> None:
         """Something moved or changed its shape: shadows are to be found anew."""
@@ -60,6 +62,7 @@ class SceneLamps:
         self._clouds.clear()
         self._direct.clear()
         self._keys.clear()
+        self.far.forget_geometry()
 
     def step(self, baked: dict[str, BakedTransfer], depsgraph: bpy.types.Depsgraph,
              warnings: list[str], seconds: float = AT_ONCE, moves: Moves | None = None,
@@ -114,11 +117,11 @@ class SceneLamps:
         return None if found is None else found.values
 
     def direct(self, name: str, baked: BakedTransfer, lamps: Sequence[LocalLight],
-               moving: Container[str] = (), moved: Move = None) -> NDArray[np.float32] | None:
+               moving: Container[str] = (), moved: Move = None, scattered: bool = True) -> NDArray[np.float32] | None:
         """The lamps' direct light (points, rows, 3) on a bake's receivers; None without a cloud, or before `step`.
 
         moving: keys of lamps that are being dragged, whose soft shadows may be coarse. moved: of the object since its
-        bake.
+        bake. scattered: whether it goes through translucent bodies, where the bake has links for that.
         """
         if baked.cloud is None or self._scene is None:
             return None
@@ -127,9 +130,13 @@ class SceneLamps:
             self._direct[key] = DirectLight(self._traced(moved), baked)
         samples = [QUICK_SAMPLES if lamp.key in moving else SHADOW_SAMPLES for lamp in lamps]
         found = self._direct[key].of(_as_seen(lamps, moved), samples)
-        if baked.links is None or not lamps:
+        if not scattered or baked.links is None or not lamps:
             return found
-        return self.scattering(name, baked).added(found, bounced_light(baked, self.cloud_light(baked, moved)))
+        return self.scattering(name, baked).added(found, self.bounced(baked, moved))
+
+    def bounced(self, baked: BakedTransfer, moved: Move = None) -> NDArray[np.float32] | None:
+        """The lamps' light on a bake's receivers by way of the scene, E / pi (points, 3); None for none."""
+        return bounced_light(baked, self.cloud_light(baked, moved))
 
     def scattering(self, name: str, baked: BakedTransfer) -> LiveScattering:
         """What takes the lamps' light through an object's translucent bodies; made once."""
@@ -137,6 +144,11 @@ class SceneLamps:
         if held is None or held[0] is not baked:
             held = self._scattering[name] = baked, LiveScattering(baked)
         return held[1]
+
+    def known_scattering(self, name: str) -> LiveScattering | None:
+        """The same, where it was made."""
+        held = self._scattering.get(name)
+        return None if held is None else held[1]
 
     def _cloud_key(self, baked: BakedTransfer) -> str:
         """`cloud_key`, computed once: redraws ask for it."""

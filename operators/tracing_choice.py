@@ -69,12 +69,12 @@ class TracingProcess(BakeProcess):
     verb: ClassVar[str] = "bake"
 
     def start(self) -> None:
-        """Start the child. PRTError when Blender can't be started once more."""
+        """Start the child, on the same graphics library as this Blender. PRTError when that can't be started."""
         try:
             (self.job / MESSAGE_FILE).write_bytes(b"")  # the child appends to it: stdout has Blender's own chatter
             with open(self.job / ERROR_FILE, "wb") as chatter:
-                self._start([*self.python_command, str(WORKER), "--", self.verb, str(self.job), wheels_folder()],
-                            chatter, chatter)
+                command = with_backend(self.python_command)
+                self._start([*command, str(WORKER), "--", self.verb, str(self.job), wheels_folder()], chatter, chatter)
         except OSError as error:
             raise StorageError(str(self.job), f"the job folder can't be written ({error.strerror})",
                                "Free some space, or choose a folder that can be written") from error
@@ -86,6 +86,16 @@ class TracingProcess(BakeProcess):
             calibration_file().unlink(missing_ok=True)
             message["remedy"] = "Bake again: it resumes, with rays traced by Embree alone"
         return message
+
+
+def with_backend(command: list[str]) -> list[str]:
+    """The command that starts Blender, with the graphics library that this one was started with."""
+    option = "--gpu-backend"
+    if bpy.app.module or "--background" not in command:
+        return command
+    chosen = sys.argv[sys.argv.index(option) + 1] if option in sys.argv[:-1] else \
+        bpy.context.preferences.system.gpu_backend.lower()
+    return [command[0], option, chosen, *command[1:]]
 
 
 class MeasureProcess(TracingProcess):

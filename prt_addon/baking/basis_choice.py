@@ -103,7 +103,7 @@ def choose_basis(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight
     if not settings.distant_light or settings.distant_basis == "sh":
         return replace(clustered, distant_basis="sh"), None
     started = time.perf_counter()
-    tracer = Tracer(scene.points, scene.triangles, settings.threads if threads is None else threads)
+    tracer = Tracer.of_scene(scene, settings.threads if threads is None else threads)
     if light is None or light.is_black:
         light = stand_in_light()
     probe = probe_light(scene, tracer, light, not is_lone_convex(scene), settings.seed)

@@ -3,7 +3,7 @@
 
 A light's energy in its bands alone says nothing of shadows: what a basis drops meets visibility, and how much of that
 lies in the same details depends on the scene (an open plane loses nothing under any sky). So some random receivers are
-traced over the whole sphere, half a million rays, and lit twice: by the light itself and by what each basis holds of
+traced over the whole sphere, a million rays, and lit twice: by the light itself and by what each basis holds of
 it. The light is the one of the error budget: an environment, its brightest pixels sampled one by one, and suns.
 
 The error is direct shadowed irradiance's: relative RMS over receivers and channels. Bounced light, smoother, comes on
@@ -37,7 +37,7 @@ from .error_budget import choose_receivers
 Double = NDArray[np.float64]
 
 # Receivers, and the cubemap that they see: its transfer holds that of every basis below.
-RECEIVERS, FINE = 192, 32
+RECEIVERS, FINE = 384, 32
 # Orders and cubemaps that are tried. Orders above those that are baked tell how fast what is left dies out.
 ORDERS, CUBEMAPS = 14, (8, 16, 32)
 # Pixels of the environment that are sampled one by one, samples along each of their sides, and samples of a sun's disc.

@@ -56,7 +56,8 @@ class BakeSettings:
         diffuse light is drawn, metals are black. Each row costs as much as the whole diffuse transfer.
     glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
         most); below, its light stays in the diffuse layer.
-    glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
+    glossy_window: whether highlights sharper than the light's order (with a cubemap, than their rows) reflect a softer
+        light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
     subsurface_links: links that each receiver of a translucent material keeps for the light of lamps, so that it
         travels through the body as they move; 64 serve, 0 = none. 16 bytes each, in the file and on the graphics card.
@@ -64,7 +65,7 @@ class BakeSettings:
         cubemap, cubemap_size along an edge (2 to 32; 16 has 1,536 columns): shadows as sharp as a texel, where
         harmonics blur them. Costs memory and time with the texels' number, highlights with that of their rows too.
         "auto": the order, or the cubemap, that keeps light_error under the scene's present light for least
-        (basis_choice.py); half a million rays find out. A later light that is sharper is shown blurred.
+        (basis_choice.py); a million rays find out. A later light that is sharper is shown blurred.
     light_error: relative RMS of shadowed irradiance that may be lost, with what an automatic choice can't hold of the
         light. Order 5 loses 2 to 5 % under most HDRIs, 10 to 30 % under a hard sun.
     sampling: which elements of a cubemap's direct light are traced. "every": all. "sparse": about an eighth of them,
@@ -142,7 +143,7 @@ class BakeSettings:
     merge_response: float = 0.05
     merged_response: str = "arithmetic"
     live_editing: bool = False
-    live_entries: int = 96
+    live_entries: int = 64
     threads: int = 0
     seed: int = 1
 

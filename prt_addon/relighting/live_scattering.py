@@ -12,12 +12,16 @@ Distant light needs none of this: it went through the body when it was baked.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
+from ..linear_algebra import sparse_multiply
+from ..transport.subsurface_links import Links
 from ..transport.surface_pyramid import SurfacePyramid
 from .exit_radiance import Baked, cluster_constants, exit_radiance
 from .subsurface_texels import unpacked_links
@@ -27,8 +31,6 @@ Single = NDArray[np.float32]
 CONSTANT = 0.5 / np.sqrt(np.pi)
 # Albedo below which a surface without view-dependent rows can't show what went through it.
 DARKEST = 1e-3
-# Texels gathered at once: what they read stays in the cache.
-BLOCK = 2048
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,9 @@ class LiveScattering:
         areas = np.zeros(self._points)
         areas[mine] = links.places[self.used, 3]
         self.pyramid = SurfacePyramid.of_places(self.receiver, baked.positions, baked.normals, areas, links.levels)
-        self._unpacked = unpacked_links(links.texels)
+        self._matrices: list[csr_array] = []
+        # How long a change of light takes here and, once that was measured, on the graphics card (inf: it can't).
+        self.seconds, self.card_seconds = np.inf, None
         self.row = 1 if baked.functions else 0
         self.factor = np.zeros((self._points, 3), np.float32)  # on what was scattered, per receiver
         self.factor[mine] = links.places[self.used, 1, None]
@@ -83,22 +87,41 @@ class LiveScattering:
         """Passes one and two: radiance (p, 3) that leaves each receiver for E / pi (p, 3) that enters; 0 where a
         receiver is not translucent."""
         means = self.pyramid.means(light)
-        moments, links = self.pyramid.moments(means), self._unpacked
+        if not self._matrices:  # not needed where a graphics card gathers
+            self._matrices = _matrices(unpacked_links(self.links.texels), len(means))
+        values = np.concatenate([means[:, None], self.pyramid.moments(means)], axis=1).reshape(-1, 3)
         result = np.zeros((self._points, 3), np.float32)
-        for start in range(0, len(self.used), BLOCK):
-            part = slice(start, start + BLOCK)
-            some = type(links)(links.node[part], links.factor[part], links.shift[part], links.bounded)
-            result[self.receiver[self.used[part]]] = some.gathered(means, moments)
+        for channel, matrix in enumerate(self._matrices):
+            light = np.ascontiguousarray(values[:, channel, None])
+            result[self.receiver[self.used], channel] = sparse_multiply(matrix, light)[:, 0]
         return result
 
     def added(self, direct: Single, bounced: Single | None) -> Single:
         """Pass three: what is to be added to the exit radiance, (p, rows, 3), for the direct light of lamps (p, rows,
         3), with their bounced light (p, 3), which is in the diffuse row already, or None."""
+        started = time.perf_counter()
         light = direct[:, 0] if bounced is None else direct[:, 0] + bounced
         result = direct.copy()
         result[:, 0] -= self.through[:, None] * light
         result[:, self.row] += self.factor * self.scattered(light)
+        self.seconds = min(self.seconds, time.perf_counter() - started)
         return result
+
+    @property
+    def prefers_card(self) -> bool:
+        """Whether the graphics card was measured to be faster."""
+        return self.card_seconds is not None and self.card_seconds < self.seconds
+
+
+def _matrices(links: Links, nodes: int) -> list[csr_array]:
+    """Per channel the links (r, K) as a matrix (r, 4 nodes): four numbers of each node, its mean and its moments."""
+    weights = np.concatenate([np.ones((*links.node.shape, 1), np.float32), links.shift], axis=2)
+    column = 4 * links.node[..., None] + np.arange(4, dtype=np.int32)
+    kept = (weights != 0.0) & links.factor.any(axis=2)[..., None]
+    starts = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))]).astype(np.int32)
+    indices = column[kept]
+    return [csr_array(((links.factor[..., channel, None] * weights)[kept], indices, starts),
+                      shape=(len(links.node), 4 * nodes)) for channel in range(3)]
 
 
 def bounced_light(baked: Baked, light: Single | None) -> Single | None:

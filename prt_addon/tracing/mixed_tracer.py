@@ -4,6 +4,10 @@
 As the paper's engine (Carr, Hall & Hart 2002, section 5.1) the CPU keeps organising the work. Tasks of `map_in_order`
 go to whoever is free: threads trace theirs by Embree, the main thread, which alone may use the graphics driver, takes
 one after the other and traces it on the GPU, so that each gets the share that it is fast enough for.
+
+Only rays that go in many directions from many origins are worth sending (`occluded_where`, `nearest_where`: the bulk of
+a bake's): on an H200 those were traced 2 to 4 times as fast as by 16 threads of Embree, transfers included, while rays
+sent one by one, with an origin and a direction each, reached 0.17 to 0.55 of it. So those stay with Embree everywhere.
 """
 
 from __future__ import annotations
@@ -19,14 +23,15 @@ from numpy.typing import NDArray
 
 from ..scene.texel_surface import TracedSurface
 from .hits import Hits
-from .ray_engine import RayDevice, RayEngine
+from .ray_engine import MOST_PAIRS, RayDevice, RayEngine
 from .tracer import Result, Tracer
 
 LEAST_RAYS = 2048  # fewer are traced by Embree before a dispatch has begun
 
 
 class MixedTracer(Tracer):
-    """A Tracer whose maker's thread uses a graphics device. device: see ray_engine.RayDevice; gpu_rays: traced on it.
+    """A Tracer whose maker's thread uses a graphics device for blocks of rays. device: see ray_engine.RayDevice;
+    gpu_rays: traced on it.
 
     Raises PRTError for a scene that the device can't hold.
     """
@@ -54,20 +59,31 @@ class MixedTracer(Tracer):
         """Whether so many rays, asked for on this thread, are traced by the device."""
         return rays >= LEAST_RAYS and threading.get_ident() == self._device_thread
 
-    def occluded(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
-                 reach: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
-        """See `Tracer.occluded`."""
-        if not self.on_device(len(origins)):
-            return super().occluded(origins, directions, reach)
-        self.gpu_rays += len(origins)
-        return self._engine.occluded(origins, directions, reach)
+    def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                       asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """See `Tracer.occluded_where`."""
+        if not self._where_on_device(asked):
+            return super().occluded_where(origins, directions, asked)
+        return self._engine.occluded_where(origins, directions, asked)
 
-    def nearest(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
-        """See `Tracer.nearest`."""
-        if not self.on_device(len(origins)):
-            return super().nearest(origins, directions)
-        self.gpu_rays += len(origins)
-        return self._named(self._engine.nearest(origins, directions))
+    def nearest_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32], asked: NDArray[np.bool_],
+                      ) -> tuple[NDArray[np.int64], NDArray[np.int64], Hits]:
+        """See `Tracer.nearest_where`."""
+        if not self._where_on_device(asked):
+            return super().nearest_where(origins, directions, asked)
+        codes = np.flatnonzero(asked)
+        which, row = np.divmod(codes, len(origins))
+        return which, row, self._named(self._engine.nearest_pairs(origins, directions, codes))
+
+    def _where_on_device(self, asked: NDArray[np.bool_]) -> bool:
+        """Whether the device traces what is asked for, which is counted then."""
+        if asked.size > MOST_PAIRS or not self.on_device(asked.size):
+            return False
+        rays = int(np.count_nonzero(asked))
+        if not self.on_device(rays):
+            return False
+        self.gpu_rays += rays
+        return True
 
     def map_in_order(self, work: Callable[[Any], Result], items: Iterable[Any]) -> Iterator[tuple[Any, Result]]:
         """See `Tracer.map_in_order`; while tasks are left, this thread does some itself."""

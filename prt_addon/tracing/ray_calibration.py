@@ -4,28 +4,42 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .ray_cost import Calibration
-from .ray_engine import CELLS, FARTHEST, GROUP, TRAVERSAL, WIDTH, RayDevice, RayEngine, in_rows, ray_texels
+from .ray_engine import (
+    CELLS,
+    FARTHEST,
+    GROUP,
+    MASKED,
+    PAIRS,
+    TRAVERSAL,
+    WIDTH,
+    RayDevice,
+    RayEngine,
+    code_texels,
+    in_rows,
+    ray_texels,
+    texels_of_bits,
+)
 
 # Kernels are measured with as many rays as take this long, so that even a software driver ends within seconds.
 KERNEL_SECONDS = 0.02
 TRIANGLES_OF_FILL = 1024
 TRANSFER_ROWS = 256  # of WIDTH texels: 8 MB
 BALLS, BALL_RINGS = 4, 16  # along each axis; quads of a ball from pole to pole
-RAYS, DIRECTIONS = 1 << 16, 16
-SECONDS_OF_RATES = 1.0
+RAYS, DIRECTIONS = 1 << 15, 16  # origins, and directions from each: rays as a bake has them
+SECONDS_OF_RATES, MOST_RUNS = 0.5, 20
 
 
 def calibrate(device: RayDevice, embree: Callable[[NDArray, NDArray, NDArray], Callable[[NDArray, NDArray], Any]],
               threads: int) -> Calibration:
-    """Measure a device. embree: given points and triangles in tracing space, what traces shadow rays (origins (n, 3),
-    one direction (1, 3)) on `threads` threads."""
+    """Measure a device. embree: given points and triangles in tracing space, what traces shadow rays from all origins
+    (n, 3) in all directions (d, 3) on `threads` threads."""
     points, triangles = ball_field()
     origins, directions = field_rays(points)
     engine = RayEngine(device, points, triangles)
@@ -34,11 +48,13 @@ def calibrate(device: RayDevice, embree: Callable[[NDArray, NDArray, NDArray], C
     latency, readback, upload = transfers(device)
     traversal = RAYS / _steady(lambda count: traversal_seconds(engine, origins[:count], directions[:1], True), RAYS)
     fill = 1.0 / seconds_per_test(engine)
-    occluded = _rate(lambda k: engine.occluded(origins, directions[k:k + 1]))
-    nearest = _rate(lambda k: engine.nearest(origins, directions[k:k + 1]))
+    step = all_pairs_seconds(engine, GROUP, TRIANGLES_OF_FILL, GROUP) / TRIANGLES_OF_FILL
+    codes, asked = np.arange(RAYS * DIRECTIONS), np.ones((DIRECTIONS, RAYS), bool)
+    occluded = _rate(lambda: engine.occluded_where(origins, directions, asked))
+    nearest = _rate(lambda: engine.nearest_pairs(origins, directions, codes))
     trace = embree(points, triangles)
-    cpu = _rate(lambda k: trace(origins, directions[k:k + 1]))
-    return Calibration(device.name, fill, readback, upload, latency, traversal, nearest, occluded, cpu, threads)
+    cpu = _rate(lambda: trace(origins, directions))
+    return Calibration(device.name, fill, readback, upload, latency, step, traversal, nearest, occluded, cpu, threads)
 
 
 def ball_field() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -133,6 +149,26 @@ def traversal_seconds(engine: RayEngine, origins: NDArray[np.float32], direction
                            answers)
 
 
+def pairs_seconds(engine: RayEngine, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                  asked: NDArray[np.bool_], occluded: bool) -> float:
+    """As `traversal_seconds`, of the pairs that are asked for (`RayEngine.nearest_pairs`, `occluded_where`)."""
+    device, codes = engine.device, np.flatnonzero(asked)
+    rays, constants = len(codes), {"origins": len(origins)}
+    textures = {"ray_origins": device.upload(ray_texels(origins, FARTHEST)),
+                "ray_directions": device.upload(ray_texels(directions, np.float32(0.0))),
+                "node_values": engine.node_texture, "triangle_values": engine.triangle_texture}
+    if occluded:
+        rays, constants["first"] = asked.size // GROUP * GROUP, 0
+        textures["asked_bits"] = device.upload(in_rows(texels_of_bits(asked.ravel()[:rays])))
+    else:
+        textures["pair_codes"] = device.upload(code_texels(codes))
+    groups = -(-rays // GROUP)
+    answers = device.empty(WIDTH, -(-(groups if occluded else groups * GROUP) // WIDTH))
+    kernel = MASKED if occluded else PAIRS
+    return _kernel_seconds(device, lambda: device.run(kernel, occluded, textures, answers,
+                                                      {"rays": rays, **constants}, groups), answers)
+
+
 def _kernel_seconds(device: RayDevice, run: Callable[[], None], answers: Any) -> float:
     """Of a kernel alone: what it takes to run it a few times more before the answers are read."""
     def several(times: int) -> None:
@@ -155,21 +191,16 @@ def _steady(measure: Callable[[int], float], wanted: int) -> float:
     return took * wanted / units
 
 
-def _rate(trace: Callable[[int], Any]) -> float:
-    """Rays per second of a call that traces RAYS rays in direction k: the best of as many calls as fit a second."""
+def _rate(trace: Callable[[], Any]) -> float:
+    """Rays per second of a call that traces all directions from all origins: the best of as many as fit the time."""
     best, began = 0.0, time.perf_counter()
-    for k in _numbers():
+    for _ in range(MOST_RUNS):
         started = time.perf_counter()
-        trace(k)
-        now = time.perf_counter()
-        best = max(best, RAYS / (now - started))
-        if now - began > SECONDS_OF_RATES and k > 0:
-            return best
+        trace()
+        best = max(best, RAYS * DIRECTIONS / (time.perf_counter() - started))
+        if time.perf_counter() - began > SECONDS_OF_RATES:
+            break
     return best
-
-
-def _numbers() -> Iterator[int]:
-    yield from (k % DIRECTIONS for k in range(1000))
 
 
 def _best(work: Callable[[], Any], runs: int) -> float:

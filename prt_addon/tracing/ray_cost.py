@@ -4,8 +4,12 @@
     GPU(R, T) = R T / fill + R gamma / readback        (Carr, Hall & Hart 2002, The Ray Engine, equation 11)
 
 R rays against T triangles; fill: tests per second; gamma: bytes read back per ray; readback: bytes per second. What the
-paper leaves out counts today: rays have to be sent as well (upload), and every dispatch has a fixed cost (latency).
-`published` is the paper's form, `seconds` has all four. Pure Python and numpy.
+paper leaves out counts today: rays have to be sent as well (upload), every dispatch has a fixed cost (latency), and a
+ray meets its triangles one after the other (step), so that few rays leave a large GPU idle:
+
+    GPU(R, T) = latency + max(R T / fill, T step) + R gamma / readback + R sent / upload
+
+`published` is the paper's form, `seconds` this one. Pure Python and numpy.
 """
 
 from __future__ import annotations
@@ -28,8 +32,9 @@ LEAST_GAIN = 1.2
 @dataclass(frozen=True)
 class Calibration:
     """Measured once per machine. device: name of the graphics driver; fill: ray-triangle tests per second; readback,
-    upload: bytes per second; latency: seconds of an empty dispatch with its readback; traversal: rays per second of the
-    kernel that walks the tree, without transfers; nearest_rays, occluded_rays: rays per second of the GPU, all
+    upload: bytes per second; latency: seconds of an empty dispatch with its readback; step: seconds from one test of a
+    ray to its next, however few rays there are; traversal: rays per second of the kernel that walks the tree, without
+    transfers; nearest_rays, occluded_rays: rays per second of the GPU, all
     included; embree_rays: of Embree's shadow rays with `threads` threads on the same scene."""
 
     device: str
@@ -37,6 +42,7 @@ class Calibration:
     readback: float
     upload: float
     latency: float
+    step: float
     traversal: float
     nearest_rays: float
     occluded_rays: float
@@ -49,7 +55,12 @@ class Calibration:
 
     def seconds(self, rays: float, triangles: float, read_bytes: float = NEAREST_BYTES) -> float:
         """The same with what the paper leaves out."""
-        return self.latency + rays * SENT_BYTES / self.upload + self.published(rays, triangles, read_bytes)
+        return self.on_device(rays, triangles, read_bytes) + rays * SENT_BYTES / self.upload
+
+    def on_device(self, rays: float, triangles: float, read_bytes: float = NEAREST_BYTES) -> float:
+        """The same for rays that are there already."""
+        tests = max(rays * triangles / self.fill, triangles * self.step)
+        return self.latency + tests + rays * read_bytes / self.readback
 
     def least_triangles(self, share: float = 0.5) -> int:
         """How many triangles a cell needs so that tests take at least this share of equation 11 (the paper's T_min)."""

@@ -12,7 +12,7 @@ Embree's space (Tracer.to_tracing_space: unit diagonal around the origin).
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -24,14 +24,15 @@ from .bounding_hierarchy import build, node_texels, triangle_texels
 from .hits import Hits
 from .ray_buckets import Buckets, CellPairs, make_buckets, pair_with_cells
 
-TRAVERSAL, CELLS = "traversal", "cells"
+TRAVERSAL, PAIRS, MASKED, CELLS = "traversal", "pairs", "masked", "cells"
 GROUP = 64  # rays of a work group; ray_answer.glsl packs that many answers
 WIDTH, LARGEST = 2048, 16384  # texels of a row, and most rows, of textures (gpu_shaders/render_data.py)
 FARTHEST = np.float32(1e37)  # how far a ray goes without a reach
+MOST_PAIRS = 1 << 24  # of all directions and origins, for the same reason as
 MOST_TRIANGLES = 1 << 23  # whole numbers up to 2^24 are exact in a texture, and three texels each fit into one
 # Windows resets a driver whose dispatch takes 2 s, and a redraw has to wait for the one under way.
 SLICE_SECONDS = 0.025
-FIRST_RAYS, LEAST_RAYS, MOST_RAYS = 1 << 13, 1 << 9, 1 << 21
+FIRST_RAYS, LEAST_RAYS, MOST_RAYS = 1 << 13, 1 << 9, 1 << 20
 # Of a loop of all pairs, in one dispatch: Mesa's software driver ends loops after 65,536 rounds, and bounded work is
 # what keeps slices short.
 MOST_STEPS = 1 << 15
@@ -119,32 +120,80 @@ class RayEngine:
               reach: NDArray[np.float32] | None, occluded: bool) -> Generator[tuple[int, int, NDArray]]:
         """Slices of the traversal: (first ray, last ray + 1, texels of the answers)."""
         check_rays(origins, directions)
-        start, shared = 0, len(directions) == 1
-        while start < len(origins):
-            count = int(np.clip(self._rays_per_second * SLICE_SECONDS, LEAST_RAYS, MOST_RAYS))
-            end = min(len(origins), start + count)
-            part = slice(start, end)
-            began = time.perf_counter()
+        shared = len(directions) == 1
+        for part in self._slices(len(origins), 1):
             texels = self._dispatch(TRAVERSAL, occluded, origins[part], directions if shared else directions[part],
                                     None if reach is None else reach[part], {"node_values": self.node_texture}, {})
+            yield part.start, part.stop, texels
+
+    def nearest_pairs(self, origins: NDArray[np.float32], directions: NDArray[np.float32], codes: NDArray[np.int64],
+                      ) -> Hits:
+        """Nearest hits of some pairs of an origin and a direction. codes: (n,) direction * len(origins) + origin.
+
+        A bake has few of both and asks for most pairs: so a ray costs four bytes to send, not 32."""
+        sent, answers = self._send_pairs(origins, directions), np.empty((len(codes), 4), np.float32)
+        for part in self._slices(len(codes), 1):
+            sent["pair_codes"] = self.device.upload(code_texels(codes[part]))
+            count = part.stop - part.start
+            answers[part] = self._run(PAIRS, False, sent, count, {"origins": len(origins)})[:count]
+        return hits_of(answers)
+
+    def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                       asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the pairs (directions, origins) that are asked for hit anything: a bit for each is sent, and one
+        comes back."""
+        sent, count = self._send_pairs(origins, directions), asked.size
+        bits = np.zeros(-(-count // GROUP) * GROUP, bool)
+        bits[:count] = asked.ravel()
+        for part in self._slices(count, GROUP):
+            whole = slice(part.start, -(-part.stop // GROUP) * GROUP)
+            sent["asked_bits"] = self.device.upload(in_rows(texels_of_bits(bits[whole])))
+            texels = self._run(MASKED, True, sent, part.stop - part.start,
+                               {"origins": len(origins), "first": part.start})
+            bits[whole] = bits_of(texels[:(whole.stop - whole.start) // GROUP])
+        return bits[:count].reshape(asked.shape)
+
+    def _send_pairs(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> dict[str, Any]:
+        """What all slices of pairs need on the device."""
+        check_rays(origins, directions)
+        if len(origins) * len(directions) > MOST_PAIRS:
+            raise ValueError(f"{len(directions)} directions from {len(origins)} origins are too many at once")
+        upload = self.device.upload
+        return {"ray_origins": upload(ray_texels(origins, FARTHEST)), "node_values": self.node_texture,
+                "ray_directions": upload(ray_texels(directions, np.float32(0.0))),
+                "triangle_values": self.triangle_texture}
+
+    def _slices(self, rays: int, multiple: int) -> Iterator[slice]:
+        """Parts of so many rays, each to be traced before the next is asked for, as which it is timed. multiple: of
+        which every part but the last has a number of rays."""
+        start = 0
+        while start < rays:
+            count = int(np.clip(self._rays_per_second * SLICE_SECONDS, LEAST_RAYS, MOST_RAYS)) // multiple * multiple
+            end, began = min(rays, start + count), time.perf_counter()
+            yield slice(start, end)
             took = time.perf_counter() - began
             self.record.note(took)
             self._rays_per_second = _next_rate(self._rays_per_second, (end - start) / took, end - start == count)
-            yield start, end, texels
             start = end
+
+    def _run(self, kernel: str, occluded: bool, textures: dict[str, Any], rays: int, constants: dict[str, int],
+             ) -> NDArray[np.float32]:
+        """Run a kernel on so many rays and read its answers, (texels, 4)."""
+        groups = -(-rays // GROUP)
+        answers = self.device.empty(WIDTH, -(-(groups if occluded else groups * GROUP) // WIDTH))
+        self.device.run(kernel, occluded, textures, answers, {"rays": rays, **constants}, groups)
+        return self.device.read(answers).reshape(-1, 4)
 
     def _dispatch(self, kernel: str, occluded: bool, origins: NDArray[np.float32], directions: NDArray[np.float32],
                   reach: NDArray[np.float32] | None, textures: dict[str, Any], constants: dict[str, int],
                   ) -> NDArray[np.float32]:
         """Send rays, run a kernel on them and read its answers, (texels, 4)."""
-        device, groups = self.device, -(-len(origins) // GROUP)
-        sent = {"ray_origins": device.upload(ray_texels(origins, FARTHEST if reach is None else reach)),
-                "ray_directions": device.upload(ray_texels(directions, np.float32(0.0))),
+        upload = self.device.upload
+        sent = {"ray_origins": upload(ray_texels(origins, FARTHEST if reach is None else reach)),
+                "ray_directions": upload(ray_texels(directions, np.float32(0.0))),
                 "triangle_values": self.triangle_texture, **textures}
-        answers = device.empty(WIDTH, -(-(groups if occluded else groups * GROUP) // WIDTH))
-        device.run(kernel, occluded, sent, answers,
-                   {"rays": len(origins), "direction_step": int(len(directions) > 1), **constants}, groups)
-        return device.read(answers).reshape(-1, 4)
+        return self._run(kernel, occluded, sent, len(origins),
+                         {"direction_step": int(len(directions) > 1), **constants})
 
     def cells_nearest(self, origins: NDArray[np.float32], directions: NDArray[np.float32], bucket_rays: int,
                       most_triangles: int) -> Hits:
@@ -262,6 +311,14 @@ def ray_texels(vectors: NDArray[np.float32], fourth: NDArray[np.float32] | np.fl
     return laid.reshape(rows, WIDTH, 4)
 
 
+def code_texels(codes: NDArray[np.int64]) -> NDArray[np.float32]:
+    """(n,) whole numbers, four to a texel, as rows of a texture. What fills the last row is never read."""
+    rows = max(1, -(-len(codes) // (4 * WIDTH)))
+    laid = np.empty(rows * WIDTH * 4, np.float32)
+    laid[:len(codes)] = codes
+    return laid.reshape(rows, WIDTH, 4)
+
+
 def hits_of(answers: NDArray[np.float32]) -> Hits:
     """Hits from answers (n, 4): distance, number, u, v. The distance of a miss is its reach."""
     number = answers[:, 1].astype(np.int32)
@@ -272,6 +329,11 @@ def hits_of(answers: NDArray[np.float32]) -> Hits:
 def bits_of(texels: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Answers of whole groups from their texels: 16 to a number, the lowest bit first."""
     return np.unpackbits(texels.astype("<u2").reshape(-1).view(np.uint8), bitorder="little").astype(bool)
+
+
+def texels_of_bits(bits: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The reverse of `bits_of`: (n,) of whole groups as (n / GROUP, 4) texels."""
+    return np.packbits(bits, bitorder="little").view("<u2").astype(np.float32).reshape(-1, 4)
 
 
 def _next_rate(known: float, measured: float, full: bool) -> float:

@@ -85,6 +85,24 @@ class Tracer:
         traced = hits.triangle, hits.u, hits.v
         return Hits(*self.surface.named(*traced), hits.front, hits.distance, traced)
 
+    def occluded_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                       asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the rays that are asked for among all (directions, origins) hit anything: the same shape, False
+        where nothing is asked. One direction after the other: coherent rays."""
+        found = np.zeros(asked.shape, bool)
+        for index in range(len(directions)):
+            chosen = np.flatnonzero(asked[index])
+            hit = self.occluded(np.take(origins, chosen, axis=0), directions[index:index + 1])
+            found[index, chosen[hit]] = True
+        return found
+
+    def nearest_where(self, origins: NDArray[np.float32], directions: NDArray[np.float32], asked: NDArray[np.bool_],
+                      ) -> tuple[NDArray[np.int64], NDArray[np.int64], Hits]:
+        """Of the rays that are asked for among all (directions, origins), in that order: which direction, which origin,
+        and the nearest hits."""
+        which, row = np.nonzero(asked)
+        return which, row, self.nearest(np.take(origins, row, axis=0), np.take(directions, which, axis=0))
+
     def map_in_order(self, work: Callable[[Any], Result], items: Iterable[Any]) -> Iterator[tuple[Any, Result]]:
         """Run `work` on items in threads, yielding (item, result) in the items' order.
 

@@ -93,12 +93,9 @@ def cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slic
     cosines = facing_cosines(directions, receivers.normals[place])
     visible, rays = cosines.copy(), 0
     if tracer is not None:
-        facing_pairs, origins = cosines > 0.0, receivers.origins[place]
-        for index in range(len(directions)):
-            facing = np.flatnonzero(facing_pairs[index])
-            rays += len(facing)
-            hit = tracer.occluded(np.take(origins, facing, axis=0), directions[index:index + 1])
-            visible[index, facing[hit]] = 0.0
+        facing = cosines > 0.0
+        rays = int(np.count_nonzero(facing))
+        visible[tracer.occluded_where(receivers.origins[place], directions, facing)] = 0.0
     # After tracing, when most pairs near the horizon are known to be dark: of the Buddha's one in seven is left, and
     # weighing all of them before would spare one ray in seven hundred.
     weigh_by_faces(receivers, place, directions, visible)

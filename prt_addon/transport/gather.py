@@ -212,9 +212,8 @@ def _hits(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, task: _Task)
     """Entries of one chunk of directions: three per hit, the barycentric weights of the corners."""
     place = task.block.receivers
     cosines = facing_cosines(task.directions, receivers.normals[place])
-    which, row = np.nonzero(cosines > 0.0)
+    which, row, hits = tracer.nearest_where(receivers.origins[place], task.directions, cosines > 0.0)
     rays = len(row)
-    hits = tracer.nearest(np.take(receivers.origins[place], row, axis=0), np.take(task.directions, which, axis=0))
     met = np.flatnonzero(hits.triangle >= 0)
     which, row = which[met], row[met]
     share = cosines[which, row]

@@ -73,8 +73,11 @@ class Links:
         if moments is not None:
             for axis in range(3):
                 light += self.shift[..., axis, None] * moments[self.node, axis]
-            np.maximum(light, 0.0, out=light)
         return np.sum(self.factor * light, axis=1)
+
+    def of(self, rows: NDArray[np.integer]) -> Links:
+        """The links of some receivers."""
+        return Links(self.node[rows], self.factor[rows], self.shift[rows], self.bounded)
 
     @property
     def sums(self) -> Single:

@@ -14,6 +14,7 @@ from tests.blender import gpu_support  # makes the checkout the package `prt`
 
 # isort: split
 from prt.prt_addon.errors import PRTError
+from prt.prt_addon.scene.texel_surface import TracedSurface
 from prt.prt_addon.tracing.mixed_tracer import LEAST_RAYS, MixedTracer
 from prt.prt_addon.tracing.ray_calibration import ball_field, calibrate, field_rays
 from prt.prt_addon.tracing.ray_cost import choose_tracer
@@ -162,6 +163,24 @@ def test_nothing_and_next_to_nothing(device):
     assert_agree(single.nearest(origins, directions), tracer.nearest(origins, directions))
 
 
+def test_pairs_of_origins_and_directions_are_the_rays_one_by_one(device):
+    engine, tracer, points = pair(device, *ball_field())
+    origins, directions = field_rays(points)
+    origins, directions = origins[:900], directions[:7]
+    asked = np.random.default_rng(3).random((7, 900)) < 0.6
+    codes = np.flatnonzero(asked)
+    which, row, theirs = tracer.nearest_where(origins, directions, asked)
+    assert np.array_equal(which * 900 + row, codes)
+    assert_agree(engine.nearest_pairs(origins, directions, codes), theirs, 2)
+    hit = tracer.occluded_where(origins, directions, asked)
+    assert not hit[~asked].any() and np.array_equal(hit[asked], theirs.triangle >= 0)
+    assert np.array_equal(engine.occluded_where(origins, directions, asked), hit)
+    assert not engine.occluded_where(origins, directions, np.zeros_like(asked)).any()
+    assert len(engine.nearest_pairs(origins, directions, codes[:0]).triangle) == 0
+    with pytest.raises(ValueError, match="too many"):
+        engine.nearest_pairs(np.zeros((1 << 16, 3), np.float32), np.ones((1 << 9, 3), np.float32), codes)
+
+
 def test_bad_rays_and_scenes_are_refused(device):
     engine, _, _ = pair(device, *closed_room(2))
     origins, directions = sphere_rays(10, 7)
@@ -204,21 +223,40 @@ def test_both_sides_share_the_work_and_keep_its_order(device):
 
     def work(k: int) -> np.ndarray:
         wheres.append(threading.get_ident())
-        part = slice(4096 * k, 4096 * (k + 1))
-        return mixed.occluded(origins[part], directions[:1])
-    found = list(mixed.map_in_order(work, range(16)))
-    assert [k for k, _ in found] == list(range(16))
+        return mixed.occluded_where(origins[4096 * k:4096 * (k + 1)], directions[:1], np.ones((1, 4096), bool))[0]
+    found = list(mixed.map_in_order(work, range(8)))
+    assert [k for k, _ in found] == list(range(8))
     assert (np.concatenate([hit for _, hit in found]) != alone.occluded(origins, directions[:1])).sum() <= 2
     assert len(set(wheres)) == 2 and 0 < mixed.gpu_rays < len(origins)
     assert mixed.gpu_rays == 4096 * wheres.count(threading.get_ident())
-    few = mixed.gpu_rays
-    mixed.nearest(origins[:LEAST_RAYS - 1], directions[:1])  # not worth a dispatch
-    assert mixed.gpu_rays == few and mixed.facts["gpu_rays"] == few
+    known = mixed.gpu_rays
+    few = np.ones((1, LEAST_RAYS - 1), bool)
+    mixed.occluded_where(origins[:LEAST_RAYS - 1], directions[:1], few)  # not worth a dispatch
+    mixed.nearest(origins, directions[:1])  # sent one by one Embree is faster
+    assert mixed.gpu_rays == known and mixed.facts["gpu_rays"] == known
+    which, row, hits = mixed.nearest_where(origins[:3000], directions[:2], np.ones((2, 3000), bool))
+    assert mixed.gpu_rays == known + 6000 and np.array_equal(which * 3000 + row, np.arange(6000))
+    assert_agree(hits, alone.nearest(origins[row], directions[which]), 2)
     closed = mixed.map_in_order(work, range(1000))
     next(closed)
     before = len(wheres)
     closed.close()
     assert len(wheres) <= before + 8
+
+
+def test_hits_on_texels_are_named_as_embrees(device):
+    """Triangles of the traced surface that stand for others of the scene (prt_addon/scene/texel_surface.py)."""
+    points, triangles = ball_field()
+    surface = TracedSurface(points.astype(np.float64), triangles, np.array([0, len(triangles)]),
+                            np.array([100, len(triangles) + 100]), (None,))
+    mixed, alone = MixedTracer(points, triangles, 1, device, surface), Tracer(points, triangles, 1, surface)
+    origins, directions = field_rays(points)
+    asked = np.ones((2, 2000), bool)
+    *_, ours = mixed.nearest_where(alone.to_tracing_space(origins[:2000]), directions[:2], asked)
+    *_, theirs = alone.nearest_where(alone.to_tracing_space(origins[:2000]), directions[:2], asked)
+    assert mixed.gpu_rays == 4000 and ours.traced is not None and theirs.triangle.max() >= 100
+    assert_agree(ours, theirs, 2)
+    assert (ours.traced[0] != theirs.traced[0]).sum() <= 2
 
 
 def test_errors_of_work_come_out(device):
@@ -238,7 +276,8 @@ def test_this_machine_measures_itself_and_chooses(device):
     tracer = Tracer(*ball_field(), 1)
 
     def embree(_points, _triangles):
-        return lambda origins, direction: tracer.occluded(tracer.to_tracing_space(origins), direction)
+        return lambda origins, directions: tracer.occluded_where(
+            tracer.to_tracing_space(origins), directions, np.ones((len(directions), len(origins)), bool))
     known = calibrate(device, embree, 1)
     assert known.device == device.name and min(known.fill, known.readback, known.upload, known.latency) > 0.0
     if "llvmpipe" in device.name:  # a software driver is no GPU
@@ -288,7 +327,7 @@ def test_a_bake_traced_on_the_gpu_is_the_bake_of_embree(device, tmp_path: Path, 
 
 def made_up(gpu_rays: float):
     from prt.prt_addon.tracing.ray_cost import Calibration
-    return Calibration("a driver", 1e9, 1e9, 1e9, 1e-4, 1e8, gpu_rays, gpu_rays, 1e7, 1)
+    return Calibration("a driver", 1e9, 1e9, 1e9, 1e-4, 1e-7, 1e8, gpu_rays, gpu_rays, 1e7, 1)
 
 
 def test_a_driver_that_falls_is_not_asked_again(tmp_path: Path, monkeypatch):

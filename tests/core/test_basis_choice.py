@@ -20,6 +20,7 @@ from prt_addon.reporting.report_file import problem_of
 from prt_addon.reporting.summary import summary
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.scene.surface_material import SurfaceMaterial
+from prt_addon.scene.texel_receivers import TexelChoice
 from tests.core.shapes import plane, sphere
 
 AUTO = {"distant_basis": "auto", "encoder": "auto", "threads": "1"}
@@ -52,18 +53,28 @@ def chosen(scene, of_light, **more):
     return settings, choice
 
 
+def beyond_harmonics(scene, of_light, **more):
+    """An error that no order keeps, and some cubemap does."""
+    _, choice = chosen(scene, of_light, **more)
+    errors = {kind: min(c["predicted_error"] for c in choice.facts["candidates"] if c["distant_basis"] == kind)
+              for kind in ("sh", "cubemap")}
+    assert errors["cubemap"] < errors["sh"]
+    return 0.5 * (errors["cubemap"] + errors["sh"])
+
+
 def test_a_soft_sky_gets_few_harmonics_and_a_sun_a_cubemap(scene):
     settings, choice = chosen(scene, light(1.0))
     assert (settings.distant_basis, settings.order, settings.encoder) == ("sh", 3, "iterative")
     assert choice.line.startswith("Sky by spherical harmonics of order 3: about ")
-    settings, choice = chosen(scene, light(0.1, 3.0), light_error="0.06")
-    assert settings.distant_basis == "cubemap" and choice.facts["chosen"]["predicted_error"] <= 0.06
-    assert "harmonics of order 10 would lose" in choice.line and "6.0 % asked" in choice.line
+    asked = beyond_harmonics(scene, light(0.1, 3.0))
+    settings, choice = chosen(scene, light(0.1, 3.0), light_error=str(asked))
+    assert settings.distant_basis == "cubemap" and choice.facts["chosen"]["predicted_error"] <= asked
+    assert "harmonics of order 10 would lose" in choice.line and choice.line.count(" asked") == 1
 
 
 def test_a_smaller_error_never_costs_less(scene):
     costs, errors = [], []
-    for asked in ("0.3", "0.1", "0.06", "0.04"):
+    for asked in ("0.3", "0.12", "0.1", str(beyond_harmonics(scene, light(0.3, 3.0)))):
         _, choice = chosen(scene, light(0.3, 3.0), light_error=asked)
         found = choice.facts["chosen"]
         costs.append(found["stored_bytes"] * found["seconds"])
@@ -136,7 +147,9 @@ def test_no_light_is_judged_under_the_stand_in_sky(scene):
 
 
 def test_the_report_tells_the_choice(scene):
-    settings = make_settings("draft", {**AUTO, "error_receivers": "0", "spacing": "0", "light_error": "0.06"})
+    quick = {"error_receivers": "0", "spacing": "0", "directions": "256", "gather_directions": "64"}
+    asked = beyond_harmonics(scene, light(0.1, 3.0), **quick)
+    settings = make_settings("standard", {**AUTO, **quick, "light_error": str(asked)})
     report = exhaust(bake(scene, settings, light=light(0.1, 3.0))).report
     assert report["choice"]["line"] and report["settings"]["distant_basis"] == "cubemap"
     assert report["basis"].startswith("Sky by a cubemap of 6 x ") and report["basis"].endswith("columns")
@@ -151,3 +164,13 @@ def test_settings_that_are_no_choice_are_refused():
     for wrong in ({"light_error": "0"}, {"light_error": "2"}, {"encoder": "automatic"}):
         with pytest.raises(BadArguments):
             make_settings("standard", wrong)
+
+
+def test_texels_of_an_atlas_are_asked_as_vertices_are(scene):
+    """Receivers that are texels see the true surface, so that they tell about the same of the light."""
+    meshes = [plane(size=4.0), sphere(centre=(0, 0, 0.9), radius=0.8, subdivisions=3)]
+    texels = SceneMesh.assemble(meshes, 1 / 40, None, TexelChoice("texels"))
+    _, ours = chosen(texels, light(0.3, 3.0))
+    _, theirs = chosen(scene, light(0.3, 3.0))
+    for found, other in zip(ours.facts["candidates"], theirs.facts["candidates"], strict=True):
+        assert 0.5 < found["basis_error"] / other["basis_error"] < 2.0

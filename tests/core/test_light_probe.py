@@ -60,7 +60,7 @@ def test_threads_change_nothing_and_rays_are_counted():
     scene, light = still_life(), light_of(0.3, [sun()])
     one, two = probe(scene, light, 1), probe(scene, light, 2)
     assert np.allclose(one.harmonics, two.harmonics, rtol=1e-6) and one.rays == two.rays
-    assert one.receivers == 192 and 192 * 2000 < one.rays < 192 * 8000
+    assert one.receivers == 384 and 384 * 2000 < one.rays < 384 * 8000
 
 
 @pytest.mark.parametrize("name", ["sun and sky", "one bright pixel", "a lamp-lit room of sky"])
