@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..prt_addon.errors import PRTError
-from ..prt_addon.linear_algebra import sparse_multiply
+from ..prt_addon.linear_algebra import sparse_multiply_few
 from ..prt_addon.relighting.material_edits import TOLERANCE
 from ..prt_addon.transport.form_factors import check_exits
 from ..prt_addon.transport.radiosity import JACOBI, MOST_ITERATIONS, Radiosity
@@ -25,6 +25,7 @@ from .render_data import texture_values
 
 # Iterations between two looks at the residual: reading a texture back waits for the GPU.
 BATCH = 8
+MEASURED = 6  # iterations by which the GPU's speed is told
 
 
 class RadiosityOnGpu:
@@ -66,12 +67,13 @@ class RadiosityOnGpu:
             if history[-1] <= tolerance or iterations >= most or not np.isfinite(history[-1]):
                 return Radiosity(values[:, :3].copy(), JACOBI, iterations, history[-1], history, seconds)
 
-    def iteration_seconds(self) -> float:
-        """What one iteration takes, from start to its values read back."""
+    def seconds(self, iterations: int) -> float:
+        """What so many iterations take, from start to their values read back."""
         black = make_texture(texture_values(np.zeros((self._receivers, 3), np.float32)))
         after = gpu.types.GPUTexture((black.width, black.height), format="RGBA32F")
         began = time.perf_counter()
-        self._iterate((black, black), black, after)
+        for _ in range(iterations):
+            self._iterate((black, black), black, after)
         read_texture(after)
         return time.perf_counter() - began
 
@@ -87,26 +89,20 @@ class RadiosityOnGpu:
         gpu.compute.dispatch(program, after.width // GROUP_SIZE, after.height, 1)
 
 
-# How many times faster the GPU must be: it looks at its residual only once in a batch.
-LEAST_GAIN = 2.0
-
-
-def faster_solver(matrix: sparse.csr_matrix) -> tuple[Callable[..., Radiosity] | None, str]:
-    """A GPU's `solve` where it was measured to be faster than the CPU's sparse product, else None; and a clause that
-    says so, for people. Measured once for a matrix, an iteration of each; without a GPU at hand the CPU it is."""
+def measured_solver(matrix: sparse.csr_matrix) -> tuple[Callable[..., Radiosity] | None, float]:
+    """The GPU's `solve`, and what one of its iterations costs in sparse products of the CPU, as measured here; None and
+    infinity without a GPU that can."""
     if bpy.app.background:
-        return None, ""
+        return None, np.inf
     values = np.ones((matrix.shape[0], 3), np.float32)
-    sparse_multiply(matrix, values)
+    sparse_multiply_few(matrix, values)
     began = time.perf_counter()
-    sparse_multiply(matrix, values)
-    cpu = time.perf_counter() - began
+    sparse_multiply_few(matrix, values)
+    product = time.perf_counter() - began
     try:
         solver = RadiosityOnGpu(matrix)
-        solver.iteration_seconds()  # compiles
-        on_gpu = solver.iteration_seconds()
+        solver.seconds(1)  # compiles
+        once, more = solver.seconds(1), solver.seconds(1 + MEASURED)
     except (PRTError, RuntimeError, SystemError, ValueError):  # a driver that can't: the CPU always can
-        return None, ""
-    if on_gpu * LEAST_GAIN < cpu:
-        return partial(solver.solve, tolerance=TOLERANCE), f" (GPU: {cpu / on_gpu:.0f} times faster here)"
-    return None, f" (CPU: {on_gpu / cpu:.1f} times faster than the GPU here)" if on_gpu > cpu else " (CPU)"
+        return None, np.inf
+    return partial(solver.solve, tolerance=TOLERANCE), max(more - once, 0.1 * more) / MEASURED / product

@@ -16,17 +16,25 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu_shaders.radiosity import faster_solver
+from ..gpu_shaders.radiosity import measured_solver
 from ..prt_addon.blender.live_materials import EditedSurfaces, edited_surfaces, read_live, slots_of_receivers
+from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import baked_mesh
 from ..prt_addon.errors import PRTError
 from ..prt_addon.relighting.exit_radiance import baked_constants, exit_radiance
+from ..prt_addon.relighting.glowing_surfaces import glow_of
 from ..prt_addon.relighting.material_edits import MaterialEdits
+from ..prt_addon.relighting.moved_light import points_in
+from ..prt_addon.reporting.wording import plural
+from ..prt_addon.scene.scene_mesh import SceneMesh
 from ..prt_addon.storage.container import LIVE_ENTRY, BakedTransfer
+from ..prt_addon.tracing.tracer import Tracer
+from ..prt_addon.transport.radiosity import BICGSTAB, GAUSS_SEIDEL, JACOBI
 
 Single = NDArray[np.float32]
 # Where a black surface glows, its glow is drawn as light on an albedo of this size.
 LEAST_ALBEDO = np.float32(1e-4)
+TITLES = {JACOBI: "Jacobi", GAUSS_SEIDEL: "Gauss-Seidel", BICGSTAB: "BiCGSTAB"}
 # Reflected colours and glow nearer than this to those before are the same.
 SAME = 1e-6
 
@@ -38,6 +46,7 @@ class Shown(Protocol):
     key: Hashable
     stale: bool
     direct: Single | None
+    moved: NDArray[np.float64] | None
 
 
 @dataclass
@@ -61,11 +70,13 @@ class Edited:
 
 @dataclass
 class _Set:
-    """The objects of one bake. surfaces: as they were read last, by name; lit: the light then."""
+    """The objects of one bake. surfaces: as they were read last, by name; lit: the light then;
+    glows: (points,) what arrives of a radiance of 1 of an object's slot."""
 
     edits: MaterialEdits
     starts: dict[str, int]
     slots: dict[str, NDArray[np.int32] | None] = field(default_factory=dict)
+    glows: dict[tuple[str, int], Single] = field(default_factory=dict)
     surfaces: dict[str, EditedSurfaces] = field(default_factory=dict)
     lit: dict[str, Hashable] = field(default_factory=dict)
     versions: int = 0
@@ -81,7 +92,7 @@ class LiveMaterials:
     seconds: float = 0.0
     answers: int = 0
     _sets: dict[str, _Set] = field(default_factory=dict)
-    _solver: str = ""
+    _tracer: tuple[bytes, Tracer] | None = None  # of everything, with the move of the set that it was made for
 
     def read(self, shown: Mapping[str, Shown], owners: Mapping[str, bpy.types.Object]) -> None:
         """Find the sets of what is shown. owners: the objects by the same names, none for instances."""
@@ -109,8 +120,7 @@ class LiveMaterials:
                 self.message = str(error)
                 return None
             if live is not None:
-                on_gpu, self._solver = faster_solver(live.matrix)
-                return MaterialEdits(live, on_gpu)
+                return MaterialEdits(live, *measured_solver(live.matrix))
         self.message = "Bounced light does not follow materials: the object that carries what it needs is not shown"
         return None
 
@@ -125,8 +135,10 @@ class LiveMaterials:
 
     def forget_geometry(self) -> None:
         """Meshes changed: which face has which material is to be read again."""
+        self._tracer = None
         for found in self._sets.values():
             found.slots.clear()
+            found.glows.clear()
 
     def step(self, shown: Mapping[str, Shown], owners: Mapping[str, bpy.types.Object],
              lights: Mapping[str, Single], depsgraph: bpy.types.Depsgraph) -> bool:
@@ -143,7 +155,7 @@ class LiveMaterials:
                 continue
             found.lit = lit
             try:
-                self._answer(found, shown, surfaces, lights, started)
+                self._answer(found, shown, surfaces, lights, depsgraph, started)
             except PRTError as error:
                 self.message = str(error)
             changed = True
@@ -164,13 +176,13 @@ class LiveMaterials:
         return surfaces
 
     def _answer(self, found: _Set, shown: Mapping[str, Shown], surfaces: dict[str, EditedSurfaces],
-                lights: Mapping[str, Single], started: float) -> None:
+                lights: Mapping[str, Single], depsgraph: bpy.types.Depsgraph, started: float) -> None:
         """Solve for a set's edits and keep what is to be drawn."""
         before, found.surfaces = found.surfaces, surfaces
         if not any(one.changed for one in surfaces.values()):
             for name in found.starts:
                 self.edited.pop(name, None)
-            self.message = ""
+            self.message, self.answers = "", self.answers + 1
             return
         points = max(start + len(shown[name].baked.positions) for name, start in found.starts.items() if name in shown)
         baked_row = np.zeros((points, 3), np.float32)
@@ -182,15 +194,55 @@ class LiveMaterials:
                 if name in surfaces:
                     change[place] = surfaces[name].albedo - shown[name].baked.albedo
                     emission[place] = surfaces[name].emission
-        added, solution = found.edits.added(change, emission, found.edits.arriving(baked_row))
+        before_glow = time.perf_counter()
+        glow = self._glow(found, shown, surfaces, points, depsgraph)
+        started += time.perf_counter() - before_glow  # traced once: what follows shall not wait as long
+        added, solution = found.edits.added(change, emission, found.edits.arriving(baked_row), glow)
         found.versions += 1
         for name, start in found.starts.items():
             if name in shown:
                 mine = added[start:start + len(shown[name].baked.positions)]
                 self._keep(name, shown[name], mine, surfaces.get(name), before.get(name), found.versions)
         self.seconds, self.answers = time.perf_counter() - started, self.answers + 1
-        self.message = (f"Bounced light follows materials: {solution.method}, {solution.iterations} iterations, "
-                        f"{self.seconds * 1e3:.0f} ms{self._solver}")
+        self.message = (f"Bounced light follows materials: {TITLES[solution.method]}, "
+                        f"{plural(solution.iterations, 'iteration', 'iterations')}, "
+                        f"{self.seconds * 1e3:.0f} ms{_where(found.edits)}")
+
+    def _glow(self, found: _Set, shown: Mapping[str, Shown], surfaces: dict[str, EditedSurfaces], points: int,
+              depsgraph: bpy.types.Depsgraph) -> Single | None:
+        """(points, 3) what arrives straight from what glows; None where nothing does. Traced once for each slot."""
+        glows = {(name, slot): colour for name, one in surfaces.items() for slot, colour in one.glows.items()}
+        if not glows:
+            return None
+        total = np.zeros((points, 3), np.float32)
+        for (name, slot), colour in glows.items():
+            if (name, slot) not in found.glows:
+                found.glows[name, slot] = self._traced_glow(found, shown, name, slot, points, depsgraph)
+            total += found.glows[name, slot][:, None] * np.asarray(colour, np.float32)
+        return total
+
+    def _traced_glow(self, found: _Set, shown: Mapping[str, Shown], name: str, slot: int, points: int,
+                     depsgraph: bpy.types.Depsgraph) -> Single:
+        baked, moved = shown[name].baked, shown[name].moved
+        chosen = (found.slots[name][baked.triangles] == slot).all(axis=1)
+        corners = baked.positions[baked.triangles[chosen]]
+        tracer, result = self._traced(depsgraph, moved), np.zeros(points, np.float32)
+        for other, start in found.starts.items():
+            if other in shown:
+                item = shown[other].baked
+                result[start:start + len(item.positions)] = glow_of(tracer, item.positions, item.normals,
+                                                                    item.triangles, corners, item.faces)
+        return result
+
+    def _traced(self, depsgraph: bpy.types.Depsgraph, moved: NDArray[np.float64] | None) -> Tracer:
+        """All that casts shadows, where a set saw it that was moved since."""
+        key = b"" if moved is None else np.round(moved, 4).tobytes()
+        if self._tracer is None or self._tracer[0] != key:
+            scene = SceneMesh.assemble(read_objects(depsgraph, None, [], ()), 0.0)
+            points = scene.points if moved is None else points_in(scene.points, moved)
+            # In Blender's own process nothing starts threads (design/architecture.md).
+            self._tracer = key, Tracer(points, scene.triangles, threads=1)
+        return self._tracer[1]
 
     def _keep(self, name: str, item: Shown, added: Single, now: EditedSurfaces | None, before: EditedSurfaces | None,
               version: int) -> None:
@@ -209,6 +261,16 @@ class LiveMaterials:
             self.edited[name] = Edited(item.baked, item.key, values)
             return
         self.edited[name] = Edited(replace(item.baked, albedo=albedo), (item.key, "edited", version), values)
+
+
+def _where(edits: MaterialEdits) -> str:
+    """Who solved, and why, as a clause."""
+    if edits.on_gpu is None:
+        return ""
+    if edits.used_gpu:
+        return " on the GPU"
+    slower = f", {edits.gpu_cost:.1f} times as fast as the GPU here" if edits.gpu_cost > 1.0 else ""
+    return f" on the CPU{slower}"
 
 
 def _same(one: EditedSurfaces, other: EditedSurfaces) -> bool:

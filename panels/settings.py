@@ -36,6 +36,10 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         bounced.active = settings.bounces
         bounced.prop(settings, "gather_directions")
         bounced.prop(settings, "bounce_error")
+        column.prop(settings, "receivers")
+        texels = column.column()
+        texels.active = settings.receivers != "vertices"
+        texels.prop(settings, "atlas_size")
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"
@@ -61,9 +65,7 @@ class PRT_PT_highlights(_Expert, bpy.types.Panel):
         shiny = column.column()
         shiny.active = settings.glossy_rows != "0"
         shiny.prop(settings, "glossy_albedo")
-        window = shiny.column()
-        window.active = settings.distant_basis == "sh"  # texels do not ring
-        window.prop(settings, "glossy_window")
+        shiny.prop(settings, "glossy_window")
         column.prop(settings, "subsurface")
         lamps = column.column()
         lamps.active = settings.lighting != "environment"

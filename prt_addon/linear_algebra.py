@@ -187,3 +187,15 @@ def sparse_multiply(a: csr_array, b: Array) -> Array:
     bit.
     """
     return a @ b
+
+
+def sparse_multiply_few(a: csr_array, b: Array) -> Array:
+    """The same for a few columns, such as colour channels: one after the other, in C order.
+
+    scipy's loop over a row's entries costs one addition per column; for three of them it takes 1.9 times as long as
+    three loops over one column each (0.8 million entries: 2.6 ms against 1.4).
+    """
+    result = np.empty((a.shape[0], b.shape[1]), np.result_type(a.dtype, b.dtype))
+    for column in range(b.shape[1]):
+        result[:, column] = a @ np.ascontiguousarray(b[:, column])
+    return result

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from ..basis.cubemap import cubemap_solid_angles, texel_of
 from ..basis.spherical_harmonics import evaluate
-from ..lighting.cubemap_light import environment_texels, sun_texels
+from ..lighting.bright_light import BrightCells, bright_texels
+from ..lighting.cubemap_light import Turn, environment_texels, sun_texels
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import for_highlights
 from ..linear_algebra import multiply
@@ -95,10 +96,17 @@ class DistantBasis:
         if not self.cubemap:
             return light.coefficients(self.order)
         total = environment_texels(light.image, self.cubemap)
+        if light.is_turned:  # as it is drawn, a turn's blur included
+            total = Turn(self.cubemap, light.rotation)(total)
         for direction, irradiance, angle in zip(light.sun_directions, light.sun_irradiance, light.sun_angles,
                                                 strict=True):
             total = total + sun_texels(direction, irradiance, float(angle), self.cubemap)
         return total
+
+    def split(self, coefficients: Double, value: int) -> tuple[BrightCells | None, Double]:
+        """Bright parts of the columns' light, to be sampled for this value of a reference, and the light (columns, 3)
+        without them."""
+        return bright_texels(coefficients, self.cubemap, value) if self.cubemap else (None, coefficients)
 
     def radiance(self, coefficients: Double, directions: Double) -> Double:
         """Radiance (n, 3) that the columns' light stands for, in unit directions (n, 3)."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lighting.bright_light import bright_pixels
 from ..lighting.reference_light import ReferenceLight
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
@@ -54,14 +55,17 @@ def error_budget(tracer: Tracer, scene: SceneMesh, albedo: NDArray[np.float32], 
     receivers = ReceiverSet.of_keys(scene, tracer, sample.keys)
     place = np.searchsorted(sample.keys, receivers.key)  # reference receivers are in Morton order
     coefficients = basis.coefficients(light)
+    bright_banded, broad = basis.split(coefficients, 0)
+    bright_full, image = bright_pixels(light.image, light.rotation, 1)
+    bright = [found for found in (bright_banded, bright_full) if found is not None]
 
     def emission(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        banded = basis.radiance(coefficients, directions)
-        return np.stack([banded, light.radiance(directions)], axis=1)
+        return np.stack([basis.radiance(broad, directions), light.looked_up(image, directions)], axis=1)
 
     suns = DistantSuns(light.sun_directions, light.sun_irradiance, light.sun_angles)
     before = tracer.rays
-    halves = yield from reference_radiance(tracer, scene, receivers, albedo, emission, suns, paths, bounces, seed)
+    halves = yield from reference_radiance(tracer, scene, receivers, albedo, emission, suns, paths, bounces, seed,
+                                           bright)
     rays = tracer.rays - before
     banded, full = halves[:, :, 0], halves[:, :, 1]
     baked = _lit(sample.transfer[place], coefficients)

@@ -18,6 +18,7 @@ from ..storage.container import LIVE_ENTRY, BakedTransfer
 from ..storage.digests import digest_arrays
 from ..transport.gather import Gather
 from ..transport.live_operator import LiveOperator, in_order_of_points, sampled_rows, sampling_error
+from .distant_basis import DistantBasis
 from .settings import BakeSettings
 from .surfaces import SurfacePlan
 
@@ -32,30 +33,29 @@ class KeptFactors:
     error: float
 
 
-def kept_factors(gathered: Gather | None, albedo: NDArray[np.float32], white: NDArray[np.floating],
-                 settings: BakeSettings) -> KeptFactors | None:
+def kept_factors(gathered: Gather | None, albedo: NDArray[np.float32], transfer: NDArray[np.float32],
+                 basis: DistantBasis, settings: BakeSettings) -> KeptFactors | None:
     """The form factors of a bake that asks for live editing; None for another, or where nothing sees anything.
 
-    albedo: (points, 3); white: (r, channels), light of a white world at the receivers, for the error.
+    albedo: (points, 3); transfer: (r, columns, channels), for the error in a white world.
     """
     if not settings.live_editing or gathered is None:
         return None
     key, matrix = gathered.receivers.key, gathered.matrix
     sampled = sampled_rows(matrix, settings.live_entries)
-    channels = white.shape[1]
-    radiosity = (albedo[key % len(albedo)][:, :channels] * white).astype(np.float32)
+    radiosity = (albedo[key % len(albedo)][:, :transfer.shape[2]] * basis.white(transfer)).astype(np.float32)
     return KeptFactors(sampled, key, sampling_error(matrix, sampled, radiosity))
 
 
 def with_live_editing(objects: dict[str, BakedTransfer], kept: KeptFactors | None, scene: SceneMesh,
                       surfaces: SurfacePlan, albedo: NDArray[np.float32], buried: NDArray[np.int64],
-                      ) -> tuple[dict[str, BakedTransfer], dict[str, Any] | None]:
+                      ) -> tuple[dict[str, BakedTransfer], dict[str, Any]]:
     """The containers with what live editing needs, and what the report tells of it; as they are without `kept`.
 
     albedo: (points, 3) that bounces light; buried: keys inside other bodies.
     """
     if kept is None:
-        return objects, None
+        return objects, {}
     targets = [o for o in scene.objects if o.is_target]
     points = np.concatenate([np.arange(o.points.start, o.points.stop) for o in targets])
     matrix, key = in_order_of_points(kept.matrix, kept.key, points, len(scene.points))
@@ -72,7 +72,7 @@ def with_live_editing(objects: dict[str, BakedTransfer], kept: KeptFactors | Non
                                      live=operator if start == 0 else None)
         start += target.points.stop - target.points.start
     told = {"bytes": operator.bytes, "entries": int(matrix.nnz), "receivers": len(key), "error": kept.error}
-    return {**objects, **found}, told
+    return {**objects, **found}, {LIVE_ENTRY: told}
 
 
 def _past_buried(matrix: sparse.csr_matrix, key: NDArray[np.int64], buried: NDArray[np.int64], scene: SceneMesh,

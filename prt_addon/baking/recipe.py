@@ -200,7 +200,7 @@ class _Bake:
                 bounced = yield from self._interreflection(gathered, transfer)
         transfer = transfer[:, :, None] if bounced is None else bounced.transfer
         self.receivers = receivers
-        self.kept_factors = kept_factors(gathered, self.albedo, self.basis.white(transfer), self.settings)
+        self.kept_factors = kept_factors(gathered, self.albedo, transfer, self.basis, self.settings)
         glossy, subsurface = None, []
         if visibility is not None and self.settings.distant_light:
             with self.timer.stage("glossy"):
@@ -846,8 +846,9 @@ class _Bake:
             objects = {target.name: with_subsurface_links(objects[target.name], self.scene, target,
                                                           self.settings.subsurface_links, self.tracer.threads)
                        for target in self.targets}
-        objects, report["live_editing"] = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces,
-                                                            self.albedo, self.buried)
+        objects, told = with_live_editing(objects, self.kept_factors, self.scene, self.surfaces, self.albedo,
+                                          self.buried)
+        report |= told
         return BakeResult(objects, report)
 
     def _white_worlds(self, encodings: dict[str, Encoding]) -> dict[str, WhiteWorld]:

@@ -56,7 +56,8 @@ class BakeSettings:
         diffuse light is drawn, metals are black. Each row costs as much as the whole diffuse transfer.
     glossy_albedo: share of the light that a highlight must return to get rows (a plastic's returns 5 to 9 %, a metal's
         most); below, its light stays in the diffuse layer.
-    glossy_window: whether highlights sharper than the light's order reflect a softer light, which has no dark rings.
+    glossy_window: whether highlights sharper than the light's order (with a cubemap, than their rows) reflect a softer
+        light, which has no dark rings.
     subsurface: whether light travels through translucent materials.
     subsurface_links: links that each receiver of a translucent material keeps for the light of lamps, so that it
         travels through the body as they move; 64 serve, 0 = none. 16 bytes each, in the file and on the graphics card.
@@ -142,7 +143,7 @@ class BakeSettings:
     merge_response: float = 0.05
     merged_response: str = "arithmetic"
     live_editing: bool = False
-    live_entries: int = 96
+    live_entries: int = 64
     threads: int = 0
     seed: int = 1
 

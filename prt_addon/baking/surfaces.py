@@ -26,6 +26,7 @@ from ..transport.brdf import (
     reflection_of_material,
     ringing_window,
 )
+from ..transport.kernel_window import softened
 from ..transport.lamp_kernel import lamp_kernel
 from .settings import BakeSettings
 
@@ -192,10 +193,15 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
     if functions is None:
         return SurfacePart(material, None, None, through, np.zeros(1), highlight, translucent, inside)
     kernel = reflection_matrix(reflection, functions, np.arange(INCIDENT_ORDER ** 2), SMALLEST_INCIDENT)
+    if settings.glossy_window and settings.distant_light and not is_harmonic(settings):
+        kernel, kept = softened(kernel, functions)
+        if kept < 1.0:
+            hints.append(f"the highlight of material {material.name}: a sun would ring in its {len(functions)} rows; a"
+                         f" window leaves {kept:.0%} of the highest band (glossy_window=false keeps all)")
     if kernel.shape[2] == 3 and np.ptp(kernel, axis=2).max() <= _GREY * np.abs(kernel).max():
         kernel = kernel[:, :, :1]
     left = diffuse_left(material, functions)
-    bands = np.ones(1)  # texels do not ring
+    bands = np.ones(1)
     if settings.glossy_window and is_harmonic(settings):
         bands = ringing_window(reflection, settings.order)
     if bands[-1] < 1.0:

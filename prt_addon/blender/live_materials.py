@@ -6,7 +6,7 @@ Form factors of a bake lie in custom properties of the mesh of one of its object
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
@@ -53,11 +53,12 @@ def read_live(mesh: bpy.types.Mesh, subject: str) -> LiveOperator | None:
 @dataclass(frozen=True)
 class EditedSurfaces:
     """Of an object's receivers now: albedo, emission (p, 3) float32, radiance of the latter; changed: whether either is
-    not as baked."""
+    not as baked; glows: by slot, the radiance of what glows."""
 
     albedo: NDArray[np.float32]
     emission: NDArray[np.float32]
     changed: bool
+    glows: dict[int, Colour] = field(default_factory=dict)
 
 
 def edited_surfaces(scene_object: bpy.types.Object, baked: BakedTransfer, slots: NDArray[np.int32]) -> EditedSurfaces:
@@ -76,7 +77,8 @@ def edited_surfaces(scene_object: bpy.types.Object, baked: BakedTransfer, slots:
     if not differs.any() and not glow.any():
         return EditedSurfaces(albedo, emission, False)
     albedo = np.where(differs[:, None], now, albedo)
-    return EditedSurfaces(np.ascontiguousarray(albedo), np.ascontiguousarray(glow[slot]), True)
+    glows = {number: tuple(float(c) for c in glow[number]) for number in np.flatnonzero(glow.any(axis=1))}
+    return EditedSurfaces(np.ascontiguousarray(albedo), np.ascontiguousarray(glow[slot]), True, glows)
 
 
 def slots_of_receivers(scene_object: bpy.types.Object, baked: BakedTransfer,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import BadScene, PRTError
 from ..lighting.cubemap_light import environment_texels
 from ..lighting.environment import band_energies, check_finite, load_equirectangular, project, total_energy
-from ..lighting.reference_light import REFERENCE_WIDTH, averaged
+from ..lighting.reference_light import reference_image
 from .nodes import constant_of, path_of, reachable, shown_images, signature, source_of
 from .world_render import render_world
 
@@ -42,7 +42,7 @@ class ProjectedImage:
     def of(make: Callable[[], NDArray[np.float32]]) -> ProjectedImage:
         """Project an image (height, width, 3), linear, top row first."""
         image = make()
-        return ProjectedImage(project(image, HIGHEST_ORDER), total_energy(image), averaged(image, REFERENCE_WIDTH),
+        return ProjectedImage(project(image, HIGHEST_ORDER), total_energy(image), reference_image(image),
                               make)
 
     def texels(self, size: int) -> NDArray[np.float64]:

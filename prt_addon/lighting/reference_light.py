@@ -6,25 +6,27 @@ Unlike coefficients it is bound to no order, so that what an order leaves out ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .analytic import sun
+from .bright_light import is_sharp
 from .environment import band_energies, direction_of_pixel, pixel_of_direction, project
 
 # Width that environments are averaged to for the reference: a pixel then covers 2.8 degrees, still far finer than any
-# order to 10 resolves (18 degrees), and a reference of some thousand paths meets every pixel with light in it.
-REFERENCE_WIDTH = 128
+# order to 10 resolves (18 degrees), and a reference of some thousand paths meets every pixel with light in it. Those
+# with a sun or the like, which a cubemap shows sharper, keep pixels of 0.7 degrees: the bright ones are sampled.
+REFERENCE_WIDTH, SHARP_WIDTH = 128, 512
 # A band with less than this share of the light's energy carries nothing: an error of 1e-3 in radiance at most.
 NEGLIGIBLE_ENERGY = 1e-6
 
 
 @dataclass(frozen=True)
 class ReferenceLight:
-    """image: (h, w, 3) float32 equirectangular radiance in world directions (rotation applied);
+    """image: (h, w, 3) float32 equirectangular radiance, turned by rotation: R (3, 3), f(R^-1 s);
     sun_directions: (s, 3) unit, towards the suns; sun_irradiance: (s, 3) W/m^2 on a facing surface;
     sun_angles: (s,) full angles in radians; description: what it is, for the report."""
 
@@ -33,18 +35,19 @@ class ReferenceLight:
     sun_irradiance: NDArray[np.float64]
     sun_angles: NDArray[np.float64]
     description: str
+    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
 
     @staticmethod
     def of(image: NDArray[np.floating], rotation: NDArray[np.float64] | None,
            suns: list[tuple[NDArray[np.float64], NDArray[np.float64], float]], description: str) -> ReferenceLight:
         """From an equirectangular image (h, w, 3), its rotation R, f(R^-1 s), and suns (direction, irradiance, angle).
         """
-        small = averaged(image, REFERENCE_WIDTH)
-        if rotation is not None:
-            small = _turned(small, np.asarray(rotation, np.float64))
+        small = reference_image(image)
         directions = np.array([s[0] for s in suns], np.float64).reshape(-1, 3)
         irradiance = np.array([s[1] for s in suns], np.float64).reshape(-1, 3)
-        return ReferenceLight(small, directions, irradiance, np.array([s[2] for s in suns], np.float64), description)
+        turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        return ReferenceLight(small, directions, irradiance, np.array([s[2] for s in suns], np.float64), description,
+                              turn)
 
     @property
     def is_black(self) -> bool:
@@ -53,12 +56,22 @@ class ReferenceLight:
 
     def radiance(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Radiance (n, 3) of the environment, suns left out, in unit directions (n, 3)."""
-        row, column = pixel_of_direction(directions, *self.image.shape[:2])
-        return self.image[row, column].astype(np.float64)
+        return self.looked_up(self.image, directions)
+
+    def looked_up(self, image: NDArray[np.float32], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (n, 3) of an image like the environment's in unit directions (n, 3) of the world."""
+        source = np.sum(directions[:, :, None] * self.rotation, axis=1) if self.is_turned else directions
+        row, column = pixel_of_direction(source, *image.shape[:2])
+        return image[row, column].astype(np.float64)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the environment's rotation is one."""
+        return bool(np.abs(self.rotation - np.eye(3)).max() > 1e-7)
 
     def coefficients(self, order: int) -> NDArray[np.float64]:
         """Coefficients (order^2, 3) of environment and suns together."""
-        total = project(self.image, order)
+        total = project(self.image, order, self.rotation if self.is_turned else None)
         for direction, irradiance, angle in zip(self.sun_directions, self.sun_irradiance, self.sun_angles, strict=True):
             total = total + sun(direction, irradiance, float(angle), order)
         return total
@@ -73,7 +86,7 @@ class ReferenceLight:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What a file needs to hold beside `header`."""
         return {"image": self.image, "sun_directions": self.sun_directions, "sun_irradiance": self.sun_irradiance,
-                "sun_angles": self.sun_angles}
+                "sun_angles": self.sun_angles, "rotation": self.rotation}
 
     def header(self) -> dict[str, Any]:
         """The JSON-able rest."""
@@ -104,19 +117,9 @@ def averaged(image: NDArray[np.floating], width: int) -> NDArray[np.float32]:
     return (sums / (share[:, None, None] * counts[None, :, None])).astype(np.float32)
 
 
-def _turned(image: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The image of f(R^-1 s): each pixel is looked up where it came from, averaged over 4 x 4 places inside it."""
-    height, width = image.shape[:2]
-    total = np.zeros_like(image, np.float64)
-    steps = (np.arange(4) + 0.5) / 4.0 - 0.5
-    rows, columns = np.arange(height)[:, None], np.arange(width)[None, :]
-    for down in steps:
-        for right in steps:
-            directions = direction_of_pixel(rows + down, columns + right, height, width)
-            source = np.sum(directions[..., :, None] * rotation, axis=-2)  # R^T s = R^-1 s
-            row, column = pixel_of_direction(source, height, width)
-            total += image[row, column]
-    return (total / 16.0).astype(np.float32)
+def reference_image(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    """An environment (h, w, 3) as fine as the reference needs it."""
+    return averaged(image, SHARP_WIDTH if is_sharp(image) else REFERENCE_WIDTH)
 
 
 def stand_in_light() -> ReferenceLight:

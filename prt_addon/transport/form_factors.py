@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..errors import BadScene
-from ..linear_algebra import sparse_multiply
+from ..linear_algebra import sparse_multiply, sparse_multiply_few
 from ..scene.scene_mesh import SceneMesh
 
 # A receiver loses light where less than 1 - LEAST_LOSS of it comes back: below, single precision can't tell.
@@ -44,9 +44,11 @@ def row_sums(matrix: sparse.csr_matrix) -> NDArray[np.float64]:
     return np.asarray(matrix.sum(axis=1, dtype=np.float64)).ravel()
 
 
-def radius_bound(matrix: sparse.csr_matrix, albedo: NDArray[np.floating]) -> float:
-    """An upper bound of the spectral radius of rho F: the largest share of light that a receiver sends back."""
-    return float((row_sums(matrix)[:, None] * albedo).max(initial=0.0))
+def radius_bound(matrix: sparse.csr_matrix, albedo: NDArray[np.floating],
+                 sums: NDArray[np.float64] | None = None) -> float:
+    """An upper bound of the spectral radius of rho F: the largest share of light that a receiver sends back. sums: of
+    the rows, where they are known."""
+    return float(((row_sums(matrix) if sums is None else sums)[:, None] * albedo).max(initial=0.0))
 
 
 def spectral_radius(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], steps: int = RADIUS_STEPS) -> float:
@@ -58,7 +60,7 @@ def spectral_radius(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], ste
     values = np.ones(albedo.shape, matrix.dtype)
     rho, estimate = albedo.astype(matrix.dtype), 0.0
     for _ in range(steps):
-        following = rho * sparse_multiply(matrix, values)
+        following = rho * sparse_multiply_few(matrix, values)
         size = np.sqrt(np.sum(np.square(following, dtype=np.float64), axis=0))
         before = np.sqrt(np.sum(np.square(values, dtype=np.float64), axis=0))
         estimate = float((size / np.maximum(before, 1e-300)).max(initial=0.0))
@@ -68,12 +70,14 @@ def spectral_radius(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], ste
     return min(estimate, radius_bound(matrix, albedo))
 
 
-def check_exits(matrix: sparse.csr_matrix, albedo: NDArray[np.floating]) -> None:
+def check_exits(matrix: sparse.csr_matrix, albedo: NDArray[np.floating],
+                sums: NDArray[np.float64] | None = None) -> None:
     """Raise BadScene where light is caught for ever: among surfaces that reflect all of it and see nothing else.
 
-    An albedo of 1 is harmless where the light finds a way to the sky or to a darker surface, however far.
+    An albedo of 1 is harmless where the light finds a way to the sky or to a darker surface, however far. sums: of
+    the rows, where they are known.
     """
-    sums = row_sums(matrix)
+    sums = row_sums(matrix) if sums is None else sums
     sent = sums[:, None] * albedo
     if float(sent.max(initial=0.0)) < 1.0 - LEAST_LOSS:
         return

@@ -53,7 +53,7 @@ def lamp_kernel(reflection: Reflection, functions: Indices, window: bool = True)
     if reflection.order <= LAMP_ORDER:
         raise ValueError(f"a lamp's kernel needs a reflection of order {LAMP_ORDER + 1}, not {reflection.order}")
     fit = _Fit.of(reflection, functions)
-    views, lamps = _profile_directions()
+    views, lamps = profile_directions()
     seen = hemisphere.evaluate(functions, views)
     values = spherical_harmonics.evaluate(LAMP_ORDER, lamps) * lamps[:, 2:]
 
@@ -70,7 +70,7 @@ def lamp_kernel(reflection: Reflection, functions: Indices, window: bool = True)
     return fit.kernel(high)
 
 
-def _profile_directions() -> tuple[Array, Array]:
+def profile_directions() -> tuple[Array, Array]:
     """Views (v, 3) at which rings are looked for, and lamps (n, 3) all over the hemisphere."""
     angle, turn = np.radians(_RINGS_SEEN_AT), np.pi / 4 * np.arange(4)
     slanted = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.full(4, np.cos(angle))], axis=1)

@@ -8,8 +8,9 @@ the error be estimated without bias by the reference's own noise: E[(x - a)(x - 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,17 @@ class PointLights:
     positions: NDArray[np.float64]
 
 
+class DirectLight(Protocol):
+    """Parts of the distant light that the emission leaves out, because paths would seldom hit them: shadow rays find
+    them instead, from every surface of a path, for one of the emission's values."""
+
+    value: int
+
+    def sample(self, numbers: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions (n, 3) by numbers (n, 3) in [0, 1), and what each brings: (n, 3) radiance over its density."""
+        ...
+
+
 @dataclass
 class _Paths:
     """Paths in flight: owner among the receivers, place and normal of their last surface, throughput (n, 3).
@@ -71,12 +83,12 @@ class _Paths:
 
 def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, albedo: NDArray[np.float32],
                        emission: Emission, suns: DistantSuns | PointLights, paths: int, bounces: int, seed: int,
-                       ) -> Generator[float, None, NDArray[np.float64]]:
+                       bright: Sequence[DirectLight] = ()) -> Generator[float, None, NDArray[np.float64]]:
     """Yield progress, return (2, r, values, 3): unit-albedo exit radiance per emission value, from two halves.
 
     albedo: (points, 3) that surfaces bounce with. emission may return several values per direction; sun light is added
     to the last one, of point lights each to its own. paths: per receiver, both halves together. bounces: most bounces,
-    -1 for all (Russian roulette).
+    -1 for all (Russian roulette). bright: what emission leaves out of the distant light.
     """
     half = max(1, paths // 2)
     at_once = max(1, PATHS_AT_ONCE // half)
@@ -87,7 +99,8 @@ def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet,
     def trace(task: tuple[int, slice]) -> tuple[NDArray[np.float64], int]:
         # Random numbers of the part's own, so that the result is the same for any number of threads.
         generator = np.random.Generator(np.random.PCG64([seed, task[0], task[1].start]))
-        return _half(tracer, scene, receivers, task[1], albedo, emission, suns, half, bounces, generator)
+        return _half(tracer, scene, receivers, task[1], albedo, emission, suns, half, bounces, generator,
+                     bright)
 
     for (which, part), (found, rays) in tracer.map_in_order(trace, parts):
         result[which].append(found)
@@ -98,7 +111,7 @@ def reference_radiance(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet,
 
 def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice, albedo: NDArray[np.float32],
           emission: Emission, suns: DistantSuns | PointLights, count: int, bounces: int, generator: np.random.Generator,
-          ) -> tuple[NDArray[np.float64], int]:
+          bright: Sequence[DirectLight]) -> tuple[NDArray[np.float64], int]:
     """Mean over `count` paths from each receiver of the part, (receivers, values, 3), and the rays traced."""
     number, rays = part.stop - part.start, 0
     values = emission(np.array([[0.0, 0.0, 1.0]])).shape[1]
@@ -112,6 +125,9 @@ def _half(tracer: Tracer, scene: SceneMesh, receivers: ReceiverSet, part: slice,
             rays += _add_suns(tracer, receivers, part, paths, suns, total, generator)
         elif depth > 0:
             rays += _add_points(tracer, paths, suns, total)
+        for light in bright:
+            towards, brought = light.sample(generator.random((len(paths.owner), 3)))
+            rays += _add_distant(tracer, receivers, part, paths, towards, brought, total[:, light.value])
         directions = _cosine_directions(paths.normals, first if depth == 0 else generator.random((len(paths.owner), 2)))
         paths, directions = _above_surface(receivers, part, paths, directions, depth)
         hits = tracer.nearest(paths.origins, directions)
@@ -159,17 +175,24 @@ def _add_suns(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths
     for direction, irradiance, angle in zip(suns.directions, suns.irradiance, suns.angles, strict=True):
         frame = tangent_frames(direction[None, :])[0]
         towards, scale = disc_directions(frame, float(angle), generator.random((len(paths.owner), 2)))
-        cosine = np.sum(paths.normals * towards, axis=1)
-        if paths.faces is None:
-            cosine *= receivers.above_faces(paths.owner + part.start, towards)
-        else:
-            cosine *= np.sum(paths.faces * towards, axis=1) > 0.0
-        facing = np.flatnonzero(cosine > 0.0)
-        seen = facing[~tracer.occluded(paths.origins[facing], towards[facing].astype(np.float32))]
-        rays += len(facing)
-        np.add.at(total[:, -1], paths.owner[seen],
-                  paths.throughput[seen] * (scale * cosine[seen, None] / np.pi) * irradiance)
+        rays += _add_distant(tracer, receivers, part, paths, towards, scale * irradiance, total[:, -1])
     return rays
+
+
+def _add_distant(tracer: Tracer, receivers: ReceiverSet, part: slice, paths: _Paths, towards: NDArray[np.float64],
+                 brought: NDArray[np.float64], total: NDArray[np.float64]) -> int:
+    """Add to a value (receivers, 3) what the paths' surfaces reflect of light from directions (n, 3) that brings (n, 3)
+    or (3,) to a facing surface; return the rays traced."""
+    cosine = np.sum(paths.normals * towards, axis=1)
+    if paths.faces is None:
+        cosine *= receivers.above_faces(paths.owner + part.start, towards)
+    else:
+        cosine *= np.sum(paths.faces * towards, axis=1) > 0.0
+    facing = np.flatnonzero(cosine > 0.0)
+    seen = facing[~tracer.occluded(paths.origins[facing], towards[facing].astype(np.float32))]
+    reflected = paths.throughput[seen] * (cosine[seen, None] / np.pi)
+    np.add.at(total, paths.owner[seen], reflected * (brought if brought.ndim == 1 else brought[seen]))
+    return len(facing)
 
 
 def _add_points(tracer: Tracer, paths: _Paths, lights: PointLights, total: NDArray[np.float64]) -> int:

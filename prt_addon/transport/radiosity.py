@@ -11,27 +11,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from itertools import count
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from ..linear_algebra import sparse_multiply
-from .form_factors import check_exits, radius_bound, spectral_radius
+from ..linear_algebra import sparse_multiply_few
+from .form_factors import check_exits, radius_bound
 from .krylov import SMALLEST, bicgstab_cycle, column_norm, conjugate_gradient_steps
 
 JACOBI, GAUSS_SEIDEL, BICGSTAB, CONJUGATE_GRADIENTS = "jacobi", "gauss-seidel", "bicgstab", "conjugate-gradients"
 METHODS = (JACOBI, GAUSS_SEIDEL, BICGSTAB, CONJUGATE_GRADIENTS)
 # What an iteration costs in units of one sparse product in single precision (benchmarks/radiosity.py prints them).
 RELATIVE_COSTS: Mapping[str, float] = {JACOBI: 1.0, GAUSS_SEIDEL: 1.0, BICGSTAB: 2.1}
-# Preparing Gauss-Seidel (a triangular factor for each channel) and the Krylov methods (double precision), likewise.
-PREPARATION: Mapping[str, float] = {GAUSS_SEIDEL: 20.0, BICGSTAB: 8.0}
+# Preparing Gauss-Seidel (a triangular factor for each channel), and what a Krylov method does before its first step.
+PREPARATION: Mapping[str, float] = {GAUSS_SEIDEL: 20.0, BICGSTAB: 2.5}
 MOST_ITERATIONS = 5000
-# Predicted Jacobi iterations up to which no better method is looked for: finding one would cost as much.
-FEW_ITERATIONS = 10
+MOST_CYCLES = 10  # of BiCGSTAB: what they do not solve is not to be solved in this precision
+# Of the brightest channel: residuals of a darker one are told relative to this share of it.
+DARKEST_CHANNEL = 1e-3
+# Residuals down to which single precision serves the Krylov methods, too, where the emittance has it.
+SINGLE_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -50,19 +52,30 @@ class Radiosity:
 
 def solve_radiosity(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], emittance: NDArray[np.floating],
                     method: str | None = None, tolerance: float = 1e-4, areas: NDArray[np.floating] | None = None,
-                    start: NDArray[np.floating] | None = None, most: int = MOST_ITERATIONS) -> Radiosity:
+                    start: NDArray[np.floating] | None = None, most: int = MOST_ITERATIONS,
+                    sums: NDArray[np.float64] | None = None) -> Radiosity:
     """Solve B = E + rho F B to a relative residual.
 
     matrix: (r, r) form factors, row = receiver that gathers; albedo, emittance: (r, channels); method: of METHODS, None
     to choose; areas: (r,), for the conjugate gradients only, which need A_i F_ij = A_j F_ji; start: a radiosity near
-    the answer (the last one of a light that changes). Raises BadScene where light would grow without end.
+    the answer (the last one of a light that changes); sums: of the matrix's rows, where they are known. Raises
+    BadScene where light would grow without end.
     """
-    check_exits(matrix, albedo)
+    check_exits(matrix, albedo, sums)
     if method is None:
-        bound = radius_bound(matrix, albedo)
-        few = predicted_iterations(JACOBI, bound, tolerance) <= FEW_ITERATIONS
-        method = JACOBI if few else choose_solver(spectral_radius(matrix, albedo), tolerance)
-    began = time.perf_counter()
+        # A bound costs nothing where sums are known, an estimate a dozen products: as many as some solutions.
+        method = choose_solver(radius_bound(matrix, albedo, sums), tolerance)
+    found = _iterate(_System(matrix, albedo, emittance, areas, tolerance), method, start, most)
+    if method == BICGSTAB and emittance.dtype == np.float32 and not found.residual <= tolerance:
+        # Single precision was not enough after all.
+        found = _iterate(_System(matrix, albedo, emittance.astype(np.float64), areas, tolerance), method, None, most)
+        found = replace(found, radiosity=found.radiosity.astype(np.float32))
+    return found
+
+
+def _iterate(system: _System, method: str, start: NDArray[np.floating] | None, most: int) -> Radiosity:
+    """Iterate until the residual is small enough, or no number any more."""
+    emittance, began = system.emittance, time.perf_counter()
     steps = {JACOBI: _jacobi, GAUSS_SEIDEL: _gauss_seidel, BICGSTAB: _bicgstab,
              CONJUGATE_GRADIENTS: _conjugate_gradients}[method]
     solution = emittance.copy() if start is None else start.astype(emittance.dtype)
@@ -70,10 +83,10 @@ def solve_radiosity(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], emi
     seconds: list[float] = []
     if not emittance.any():
         return Radiosity(np.zeros_like(emittance), method, 0, 0.0)
-    for solution, residual in steps(_System(matrix, albedo, emittance, areas, tolerance), solution):  # noqa: B007, B020
+    for solution, residual in steps(system, solution):  # noqa: B007, B020
         history.append(residual)
         seconds.append(time.perf_counter() - began)
-        if residual <= tolerance or len(history) >= most or not np.isfinite(residual):
+        if residual <= system.tolerance or len(history) >= most or not np.isfinite(residual):
             break
     return Radiosity(solution.astype(emittance.dtype, copy=False), method, len(history), history[-1], history, seconds)
 
@@ -99,9 +112,13 @@ def choose_solver(radius: float, tolerance: float, costs: Mapping[str, float] = 
                   preparation: Mapping[str, float] = PREPARATION) -> str:
     """The method that is predicted to be done first. costs: of an iteration of each method at hand, preparation: before
     the first, in any common unit; those of `RELATIVE_COSTS` where nothing was measured."""
-    def total(method: str) -> float:
-        return costs[method] * predicted_iterations(method, radius, tolerance) + preparation.get(method, 0.0)
-    return min(costs, key=total)
+    return min(costs, key=lambda method: predicted_cost(method, radius, tolerance, costs, preparation))
+
+
+def predicted_cost(method: str, radius: float, tolerance: float, costs: Mapping[str, float] = RELATIVE_COSTS,
+                   preparation: Mapping[str, float] = PREPARATION) -> float:
+    """What a solution will cost, in the unit of the costs."""
+    return costs[method] * predicted_iterations(method, radius, tolerance) + preparation.get(method, 0.0)
 
 
 @dataclass(frozen=True)
@@ -115,8 +132,10 @@ class _System:
     tolerance: float
 
     def size(self) -> NDArray[np.float64]:
-        """(channels,) norms of the emittance."""
-        return np.maximum(column_norm(self.emittance.astype(np.float64)), SMALLEST)
+        """(channels,) norms of the emittance; of a much darker channel than the brightest as of one not so dark, whose
+        rounding would otherwise never be solved away."""
+        norms = column_norm(self.emittance.astype(np.float64))
+        return np.maximum(norms, max(DARKEST_CHANNEL * float(norms.max(initial=0.0)), SMALLEST))
 
     def residual_of(self, left: NDArray[np.floating]) -> float:
         """Relative residual of the worst channel, of what is left (r, channels)."""
@@ -135,10 +154,10 @@ def _jacobi(system: _System, values: NDArray[np.floating]) -> Steps:
     matrix = system.matrix.astype(kind, copy=False)
     albedo = system.albedo.astype(kind)
     inverse = (1.0 / (1.0 - albedo * matrix.diagonal()[:, None])).astype(kind)
-    left = system.emittance + albedo * sparse_multiply(matrix, values) - values
+    left = system.emittance + albedo * sparse_multiply_few(matrix, values) - values
     while True:
         values = values + inverse * left
-        left = system.emittance + albedo * sparse_multiply(matrix, values) - values
+        left = system.emittance + albedo * sparse_multiply_few(matrix, values) - values
         yield values, system.residual_of(left)
 
 
@@ -155,12 +174,12 @@ def _gauss_seidel(system: _System, values: NDArray[np.floating]) -> Steps:
     lower = sparse.tril(system.matrix, 0, format="csc").astype(np.float64)
     factors = [_triangular(lower, albedo[:, part.start or 0]) for part in channels]
     values, emittance = values.astype(np.float64), system.emittance.astype(np.float64)
-    above = albedo * sparse_multiply(upper, values)
+    above = albedo * sparse_multiply_few(upper, values)
     while True:
         right = emittance + above
         for part, factor in zip(channels, factors, strict=True):
             values[:, part] = factor.solve(np.ascontiguousarray(right[:, part]))
-        before, above = above, albedo * sparse_multiply(upper, values)
+        before, above = above, albedo * sparse_multiply_few(upper, values)
         yield values, system.residual_of(above - before)
 
 
@@ -173,21 +192,22 @@ def _triangular(lower: sparse.csc_matrix, albedo: NDArray[np.float64]) -> sparse
 
 
 def _bicgstab(system: _System, values: NDArray[np.floating]) -> Steps:
-    """BiCGSTAB on (I - rho F) B = E."""
-    matrix, albedo = system.matrix.astype(np.float64), system.albedo.astype(np.float64)
-    emittance, solution = system.emittance.astype(np.float64), values.astype(np.float64)
+    """BiCGSTAB on (I - rho F) B = E, in the emittance's precision where that is enough."""
+    kind = system.emittance.dtype if system.tolerance >= SINGLE_TOLERANCE else np.dtype(np.float64)
+    matrix, albedo = system.matrix.astype(kind, copy=False), system.albedo.astype(kind)
+    emittance, solution = system.emittance.astype(kind), values.astype(kind)
 
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return values - albedo * sparse_multiply(matrix, values)
+        return values - albedo * sparse_multiply_few(matrix, values)
 
-    for cycle in count():
+    for cycle in range(MOST_CYCLES):
         residual, history = emittance - apply(solution), []
         reached = system.residual_of(residual)
         if cycle or reached <= system.tolerance:
             yield solution, reached
         for _ in bicgstab_cycle(apply, solution, residual, system.size(), system.tolerance, history):
             # Of the last step of a cycle the true residual is told, with the next cycle.
-            if history[-1] > system.tolerance:
+            if not history[-1] <= system.tolerance:
                 yield solution, history[-1]
 
 
@@ -204,11 +224,11 @@ def _conjugate_gradients(system: _System, values: NDArray[np.floating]) -> Steps
     into, out = np.sqrt(albedo * area), np.sqrt(albedo / area)
 
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return values - into * sparse_multiply(matrix, out * values)
+        return values - into * sparse_multiply_few(matrix, out * values)
 
     # From a radiosity: sqrt(rho A) H = sqrt(A / rho) (B - E) is undefined for black surfaces, sqrt(rho A) F B is not.
-    solution = into * sparse_multiply(matrix, values.astype(np.float64))
-    residual = into * sparse_multiply(matrix, emittance) - apply(solution)
+    solution = into * sparse_multiply_few(matrix, values.astype(np.float64))
+    residual = into * sparse_multiply_few(matrix, emittance) - apply(solution)
     for left in conjugate_gradient_steps(apply, solution, residual):
         # In radiosity E - M B = rho F B - rho H = sqrt(rho / A) times what is left of y.
         yield emittance + out * solution, system.residual_of(out * left)

@@ -93,15 +93,13 @@ def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.Wo
     """Give the scene a world of this equirectangular image, turned by a Mapping node (type Point)."""
     from pathlib import Path
 
+    import OpenEXR
+
+    # Not by Blender's own save: that writes such a picture through the sRGB curve, in which Cycles then interpolates:
+    # a sun of a few pixels lost a sixth of its light.
     path = Path(folder) / "environment.exr"
-    stored = bpy.data.images.new("environment", image.shape[1], image.shape[0], float_buffer=True)
-    stored.colorspace_settings.name = "Linear Rec.709"
-    pixels = np.ones((*image.shape[:2], 4), np.float32)
-    pixels[..., :3] = image[::-1]  # Blender's images start at the bottom
-    stored.pixels.foreach_set(pixels.ravel())
-    stored.filepath_raw, stored.file_format = str(path), "OPEN_EXR"
-    stored.save()
-    bpy.data.images.remove(stored)
+    with OpenEXR.File({}, {"RGB": np.ascontiguousarray(image, np.float32)}) as file:
+        file.write(str(path))
     world = bpy.data.worlds.new("Environment")
     if world.node_tree is None:
         world.use_nodes = True
@@ -109,6 +107,7 @@ def environment_world(image: np.ndarray, degrees: float, folder) -> bpy.types.Wo
     texture, mapping = tree.nodes.new("ShaderNodeTexEnvironment"), tree.nodes.new("ShaderNodeMapping")
     coordinate = tree.nodes.new("ShaderNodeTexCoord")
     texture.image = bpy.data.images.load(str(path))
+    texture.image.colorspace_settings.name = "Linear Rec.709"
     mapping.inputs["Rotation"].default_value = (0.0, 0.0, math.radians(degrees))
     tree.links.new(coordinate.outputs["Generated"], mapping.inputs["Vector"])
     tree.links.new(mapping.outputs["Vector"], texture.inputs["Vector"])

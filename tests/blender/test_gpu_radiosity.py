@@ -60,3 +60,23 @@ def test_what_never_grows_dark_is_refused_on_the_gpu_too():
 
     with pytest.raises(BadScene):
         RadiosityOnGpu(sparse.identity(4, np.float32, "csr")).solve(np.ones((4, 3)), np.ones((4, 3)))
+
+
+@pytest.mark.parametrize(("cost", "on_gpu"), [(1e-3, True), (10.0, False)])
+def test_edits_are_solved_where_it_is_faster_and_come_out_the_same(problem, cost, on_gpu):
+    from prt.gpu_shaders.radiosity import RadiosityOnGpu
+    from prt.prt_addon.relighting.material_edits import TOLERANCE, MaterialEdits
+    from prt.prt_addon.transport.live_operator import LiveOperator
+
+    matrix, albedo, light = problem
+    live = LiveOperator(matrix, 0.5 * albedo, np.ones(len(albedo), np.float32))
+    solver = RadiosityOnGpu(matrix)
+
+    def solve(albedo, source, start):
+        return solver.solve(albedo, source, start, TOLERANCE)
+
+    expected, _ = MaterialEdits(live).added(0.3 * albedo, 0.1 * light, light)
+    edits = MaterialEdits(live, solve, cost)
+    found, _ = edits.added(0.3 * albedo, 0.1 * light, light)
+    assert edits.used_gpu == on_gpu
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 2.0 * TOLERANCE * np.sqrt(np.mean(expected ** 2))

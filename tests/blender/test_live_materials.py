@@ -41,7 +41,8 @@ def inputs_of(material: bpy.types.Material) -> bpy.types.NodeInputs:
 def bake_all() -> None:
     """Bake everything in this process, as a session does."""
     graph, settings = depsgraph(), make_settings("standard", SETTINGS)
-    scene = SceneMesh.assemble(read_objects(graph), settings.spacing, split_slots=settings.live_editing)
+    scene = SceneMesh.assemble(read_objects(graph), settings.spacing, texels=settings.texels,
+                               split_slots=settings.live_editing)
     found = {o.name: bpy.data.objects[o.name] for o in scene.objects}
     digests = {name: fingerprint.fingerprint(o, graph, settings.live_editing) for name, o in found.items()}
     around = fingerprint.surroundings(graph)
@@ -115,6 +116,24 @@ def test_an_edited_colour_is_followed_within_a_percent_of_a_fresh_bake_and_is_no
     live = follow_materials()
     assert not live.materials.edited
     fresh = drawn(live)
+    for name in room:
+        assert rms(found[name] - fresh[name]) < 0.01 * rms(fresh[name]), name
+        assert rms(before[name] - fresh[name]) > 0.02 * rms(fresh[name]), name
+
+
+def test_texels_follow_as_vertices_do(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SETTINGS, "receivers", "texels")
+    bake_all()
+    live_preview._lives.clear()
+    live = follow_materials()
+    before = drawn(live)
+    assert live.shown["Floor"].baked.texels is not None and live.materials.present
+    inputs_of(bpy.data.materials["Right"])["Base Color"].default_value = (0.9, 0.1, 0.05, 1.0)
+    found = drawn(follow_materials())
+    assert not any(listed().values())
+    bake_all()
+    live_preview._lives.clear()
+    fresh = drawn(follow_materials())
     for name in room:
         assert rms(found[name] - fresh[name]) < 0.01 * rms(fresh[name]), name
         assert rms(before[name] - fresh[name]) > 0.02 * rms(fresh[name]), name

@@ -173,7 +173,8 @@ def test_reference_light_keeps_all_light_of_a_one_pixel_sun():
     image = np.zeros((512, 1024, 3), np.float32)
     image[100, 300] = 1e6
     light = ReferenceLight.of(image, None, [], "one pixel")
-    assert light.image.shape == (64, 128, 3)
+    assert light.image.shape == (256, 512, 3)  # finer than that of an even light, which is 128 wide
+    assert ReferenceLight.of(np.ones_like(image), None, [], "even").image.shape == (64, 128, 3)
     assert np.allclose(light.coefficients(1), project(image, 1), rtol=1e-6)
     assert averaged(np.ones((100, 250, 3), np.float32), 128) == pytest.approx(1.0)
 

@@ -68,6 +68,20 @@ def test_a_bright_pixel_is_where_the_environment_says_at_any_rotation():
         assert np.arccos(mean @ (rotation @ direction) / np.linalg.norm(mean)) < 0.5 * angular_size(8)
 
 
+@pytest.mark.parametrize("r", [8, 16])
+def test_a_sun_of_a_few_pixels_keeps_its_place_within_a_texel(r):
+    # What a lit surface feels of a sun is its flux times its direction: as a lamp's, not the texel's middle.
+    for row, column in ((17, 3), (40, 77), (29, 101), (55, 60)):
+        image = np.full((128, 256, 3), 0.2)
+        image[row, column] = 1e4
+        found = environment_texels(image, r) - environment_texels(np.full((128, 256, 3), 0.2), r)
+        direction = environment.direction_of_pixel(row, column, 128, 256)
+        lamp = sun_texels(direction, [1.0, 1.0, 1.0], 0.0, r)
+        assert np.allclose(found / found.sum(), lamp / lamp.sum(), atol=1e-3)
+        moment = (found[:, 0] * cubemap_solid_angles(r)) @ cubemap_directions(r)
+        assert np.arccos(moment @ direction / np.linalg.norm(moment)) < 0.05 * angular_size(r)
+
+
 def test_environment_texels_agree_with_the_harmonics_of_the_image():
     image = np.abs(RANDOM.normal(size=(40, 80, 3))) ** 4
     rotation = random_rotation(2, 9)

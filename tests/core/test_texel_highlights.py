@@ -16,7 +16,7 @@ from prt_addon.baking.surfaces import plan_surfaces
 from prt_addon.baking.translucency import light_through_bodies
 from prt_addon.basis.cubemap import cubemap_directions, cubemap_solid_angles, sample_directions
 from prt_addon.basis.hemisphere import evaluate as hemisphere_values
-from prt_addon.basis.hemisphere import functions_of
+from prt_addon.basis.hemisphere import functions_of, gram_matrix
 from prt_addon.basis.spherical_harmonics import evaluate
 from prt_addon.lighting.cubemap_light import Turn
 from prt_addon.relighting.exit_radiance import view_radiance
@@ -26,6 +26,8 @@ from prt_addon.tracing.tracer import Tracer
 from prt_addon.transport.brdf import reflection_matrix, reflection_of_material
 from prt_addon.transport.cubemap_transfer import cubemap_transfer
 from prt_addon.transport.glossy import GlossySurfaces, filled_rows, surface_frames
+from prt_addon.transport.kernel_window import softened
+from prt_addon.transport.lamp_kernel import profile_directions
 from prt_addon.transport.receiver_set import ReceiverSet
 from prt_addon.transport.reflectance import PrincipledLobe
 from prt_addon.transport.texel_visibility import SEEN, TexelLight, TexelVisibility
@@ -201,6 +203,23 @@ def test_a_stopped_bake_goes_on_with_its_highlights(texels, tmp_path):
     assert set(again.report["resumed"]) == {"gather", "direct", "interreflection", "glossy"}
     light = smooth_light(cubemap_directions(8))
     np.testing.assert_allclose(shown(again.objects["sphere"], light), shown(texels.objects["sphere"], light), atol=1e-4)
+
+
+def test_a_sharp_highlight_is_softened_until_a_small_light_hardly_rings():
+    """At roughness 0.3 the rows swing to a sixth below black; a rough one keeps every bit; white stays white."""
+    white = gram_matrix(np.arange(49))[0]
+    views, lights = profile_directions()
+    for roughness, changes in ((0.3, True), (0.6, False)):
+        material = replace(METAL, roughness=roughness)
+        kernel = reflection_matrix(reflection_of_material(material, INCIDENT), FUNCTIONS)
+        soft, kept = softened(kernel, FUNCTIONS)
+        assert (kept < 0.5) == changes == (not np.array_equal(soft, kernel))
+        expected = np.einsum("kjc,j->kc", kernel, white)
+        np.testing.assert_allclose(np.einsum("kjc,j->kc", soft, white), expected, atol=1e-10)
+        shown_lights = evaluate(INCIDENT, lights).T
+        lowest = [np.min(profile.min(axis=1) / profile.max(axis=1)) for profile in (
+            hemisphere_values(FUNCTIONS, views) @ matrix.mean(axis=2) @ shown_lights for matrix in (kernel, soft))]
+        assert lowest[1] > 0.6 * min(lowest[0], -0.05) and (lowest[0] < -0.15) == changes
 
 
 def test_the_budget_measures_highlights():
