@@ -42,6 +42,7 @@ SCRIPTS = {
     "display": ("display_in_blender.py", "make_display.py"),
     "sky": ("sky_in_blender.py", "make_display.py"),
     "editing": ("editing_in_blender.py", "make_editing.py"),
+    "texels": ("texels_in_blender.py", "make_display.py"),
 }
 RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
 COMMAND_SECONDS = 240
