@@ -10,7 +10,7 @@ A mesh on a ground, both grey, under HDRIs of a broad sky and a sun of one degre
 light, in several places, and under the sky alone. All bounces. Error: relative RMS of radiance at random vertices of
 both against what Cycles shows around them, its own noise taken out by baking twice (tests/blender/cycles.py,
 shown_radiance); the mean over the suns. Bake: processor seconds of all threads, which other work hardly changes:
-gather, shadows, bounces and encoding, without the error budget; of one representation's encodings the first three are shared.
+gather, shadows, bounces and encoding, without the error budget; a representation's encodings share the first three.
 Change: turning the light, constants of all clusters, radiance at all receivers, on one processor. Bytes: bases, weights
 and cluster numbers. Goes on after what the folder holds.
 
