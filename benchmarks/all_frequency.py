@@ -356,7 +356,7 @@ def tell(rows: list[Row], plot: Path | None) -> None:
                 reached(rows))
     if plot is None:
         return
-    groups = ("harmonics", "clusters, 16", "clusters, 32", "eigentransport, 32", "Haar, 32")
+    groups = ("harmonics", "clusters, 16", "clusters, 32", "eigentransport, 16", "Haar, 32")
     pictures = []
     for name, value in (("bytes", lambda r: float(r.bytes)), ("processor seconds of the bake", lambda r: r.seconds)):
         drawn = [Curve(group, front([(value(r), r.error) for r in rows if r.group == group])) for group in groups]
