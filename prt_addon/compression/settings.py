@@ -26,7 +26,8 @@ class EncoderSettings:
         error by some 4 % in two to three times the time.
     restarts: how many of the paper's random starts to try beside the splits; None lets the signal's size decide, and a
         target_error makes do with the splits.
-    together: vectors that are added together while wide signals are iterated; more end sooner, with more error.
+    together: vectors that are added together while wide signals are iterated; more end sooner, with a little more
+        error.
     threads: that work at the same time, 0 = one for each core; the result does not depend on it.
     """
 
