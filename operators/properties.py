@@ -73,18 +73,9 @@ DISTANT_BASIS_ITEMS = (
 SAMPLING_ITEMS = (
     ("automatic", "Automatic", "All texels, unless fewer are surely faster and exact enough. The report says why", 0),
     ("every", "Every Element", "Rays for all texels at all receivers. No error, and mostly the fastest", 1),
-    ("sparse", "Sparse", "Rays for about an eighth of them; the rest is woven from neighbours. At best nearly twice "
-                         "as fast, on detailed meshes; slower on simple ones. Adds about 1 % of error, which the report "
-                         "states",
-     2),
-)
-RECEIVERS_ITEMS = (
-    ("vertices", "Vertices", "Light is kept at the mesh's vertices, and between them on faces longer than Longest "
-                             "Edge. The least data for fine meshes", 0),
-    ("texels", "Texels", "Light is kept in a picture laid over each object, Longest Edge apart: walls of two triangles "
-                         "get fine shadows, and the light can be exported as textures. Costs a little more data, and "
-                         "many small texels on fine or faceted meshes", 1),
-    ("auto", "Automatic", "Texels on objects whose faces are much longer than Longest Edge, vertices on all others", 2),
+    ("sparse", "Sparse", "Rays for about an eighth of them; the rest is woven from neighbours. At best nearly twice as "
+                         "fast, on detailed meshes; slower on simple ones. Adds about 1 % of error; the report states "
+                         "it", 2),
 )
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
