@@ -77,6 +77,14 @@ SAMPLING_ITEMS = (
                          "fast, on detailed meshes; slower on simple ones. Adds about 1 % of error; the report states "
                          "it", 2),
 )
+RECEIVERS_ITEMS = (
+    ("vertices", "Vertices", "Light is kept at the mesh's vertices, and between them on faces longer than Longest "
+                             "Edge. The least data for fine meshes", 0),
+    ("texels", "Texels", "Light is kept in a picture laid over each object, Longest Edge apart: walls of two triangles "
+                         "get fine shadows, and the light can be exported as textures. Costs a little more data, and "
+                         "many small texels on fine or faceted meshes", 1),
+    ("auto", "Automatic", "Texels on objects whose faces are much longer than Longest Edge, vertices on all others", 2),
+)
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
     ("collection", "Collection", "The meshes of a collection, whatever is selected", 1),
