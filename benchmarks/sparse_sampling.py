@@ -369,7 +369,7 @@ def metal_ring() -> ObjectMesh:
 
 
 def caustic(name: str, arguments: argparse.Namespace) -> None:
-    """Caustics of a metal ring on a ground plane: elements by paths, sparsely and all of them, and paths that follow the
+    """Caustics of a metal ring on the ground: elements by paths, sparsely and all of them, and paths that follow the
     lobe, which carry all columns at once. name is not used."""
     del name
     line = (np.arange(CAUSTIC_SIDE) / (CAUSTIC_SIDE - 1) - 0.5) * 2.4

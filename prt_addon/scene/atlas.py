@@ -289,7 +289,8 @@ def _nearest(places: Double, owner: NDArray[np.int64], corner_texels: NDArray[np
              width: int) -> _Nearest:
     """owner (n,), corner_texels (n, 4): triangles and the texels around the squares that they touch."""
     # A texel's own triangles come four times; each pair is looked at once.
-    pair = np.unique(np.repeat(owner, 4) * len(texel_key) + corner_texels.ravel())
+    pair = np.sort(np.repeat(owner, 4) * len(texel_key) + corner_texels.ravel())
+    pair = pair[np.concatenate([[True], pair[1:] != pair[:-1]])]
     triangle, texel = pair // len(texel_key), pair % len(texel_key)
     best = np.full(len(texel_key), np.inf)
     result = _Nearest(np.zeros(len(texel_key), np.int64), np.zeros((len(texel_key), 3)), best)
