@@ -24,6 +24,7 @@ from .operators.export import PRT_OT_export
 from .operators.interrupted import PRT_OT_discard_interrupted, PRT_OT_resume
 from .operators.job_mixin import JobMixin
 from .operators.keyframe_light import PRT_OT_keyframe_light
+from .operators.light_images import PRT_OT_light_images
 from .operators.measure_tracing import PRT_OT_measure_tracing
 from .operators.preview import PRT_OT_toggle_preview
 from .operators.relight import PRT_OT_relight
@@ -53,6 +54,7 @@ CLASSES = (
     PRT_OT_clear,
     PRT_OT_toggle_preview,
     PRT_OT_relight,
+    PRT_OT_light_images,
     *light_presets.CLASSES,
     PRT_OT_keyframe_light,
     PRT_OT_draw_camera,

@@ -3,7 +3,8 @@
 
     python benchmarks/sparse_sampling.py PART [--scene horse,bunny,buddha] [--edge 32] [--threads 2]
 
-PART: direct (Figures 9, 10), radius (Figure 6), encode (Figure 11), indirect, glossy (Figure 20), pays (where it does).
+PART: direct (Figures 9, 10), radius (Figure 6), encode (Figure 11), indirect, glossy (Figure 20), pays (where it does),
+full (Figure 6's control), caustic (a metal ring), bake (texels as bakes sample them).
 A scene is one of the shared meshes on a ground plane of 29,241 vertices from -2 to 2, as the paper's; model and ground
 are sampled and told apart. Light for errors: Blender's forest, sunset and city. docs/sparse_precomputation.md.
 """
@@ -23,6 +24,7 @@ from common import drain, load_obj, mesh_path, print_table, smooth_object
 from numpy.typing import NDArray
 from paper_signals import load_ply
 
+from prt_addon.baking.sampling import sparse_settings
 from prt_addon.basis.directions import quadrature
 from prt_addon.compression.dense_first import encode_dense_first
 from prt_addon.compression.encoding import encode
@@ -30,22 +32,29 @@ from prt_addon.compression.settings import EncoderSettings
 from prt_addon.lighting.cubemap_light import environment_texels
 from prt_addon.lighting.environment import load_equirectangular
 from prt_addon.linear_algebra import multiply
+from prt_addon.scene.object_mesh import ObjectMesh
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.scene.surface_material import SurfaceMaterial
 from prt_addon.tracing.tracer import Tracer
+from prt_addon.transport.caustic_elements import CausticElements, GlossySurfaces, gathered_caustics
 from prt_addon.transport.cubemap_transfer import bounced_columns, cubemap_transfer
 from prt_addon.transport.elements import Elements, MatrixElements, VisibilityElements
 from prt_addon.transport.factored_brdf import FactoredElements, factored
 from prt_addon.transport.gather import gather_operator
 from prt_addon.transport.path_elements import PathElements
 from prt_addon.transport.receiver_set import ReceiverSet
+from prt_addon.transport.reflectance import PrincipledLobe
 from prt_addon.transport.sparse_sampling import SparseSettings, SparseTransfer, sparse_transfer
+from prt_addon.transport.texel_elements import TexelElements
 
 FILES = {"horse": "vtk_horse.ply", "bunny": "stanford-bunny.obj", "buddha": "buddha_nirj.obj"}
 GROUND_SIDE, GROUND_SIZE, HEIGHT = 171, 4.0, 1.4
 WORLDS = ("forest", "sunset", "city")
 ALBEDO = 0.6
 BLOCK = 256
+# The ring of the caustics, vertices along the ground's side, paths of an element, and the radius of neighbours.
+RING_SEGMENTS, RING_RADIUS, RING_HEIGHT, RING_ROUGHNESS = 96, 0.6, 0.4, 0.4
+CAUSTIC_SIDE, CAUSTIC_PATHS, CAUSTIC_RADIUS = 49, 64, 0.06
 # Paths and bounces of the element-wise path tracer, and how many elements tell what one costs.
 PATHS, BOUNCES, TIMED = 16, 2, 200_000
 
@@ -182,7 +191,8 @@ def full(name: str, arguments: argparse.Namespace) -> None:
     rows = []
     for share in (0.01, 0.018, 0.035, 0.06):
         row: list = [share * np.sqrt(2.0) * GROUND_SIZE]
-        for method, features in (("l1", 350 / 6144), ("least_squares", 350 / 6144), ("least_squares", 1.0), ("l1", 1.0)):
+        few = 350 / 6144
+        for method, features in (("l1", few), ("least_squares", few), ("least_squares", 1.0), ("l1", 1.0)):
             settings = SparseSettings(radius=share, neighbours=96, method=method, features=features,
                                       samples_stand=False)
             elements = VisibilityElements(scene.tracer, scene.parts["ground"], arguments.edge)
@@ -326,8 +336,85 @@ def pays(name: str, arguments: argparse.Namespace) -> None:
                  "all by paths s (from the cost)", "sparse by paths s (from the cost)", "limit of the gain"], rows)
 
 
+def bake_texels(name: str, arguments: argparse.Namespace) -> None:
+    """Texels as bakes sample them, means over several rays: all of them against sparse sampling; processor seconds."""
+    scene, rows = build(name, arguments.threads), []
+    for edge, samples in ((8, 4), (16, 2), (32, 1)):
+        light = world_lights(edge)
+        for part, receivers in scene.parts.items():
+            started = time.process_time()
+            truth = drain(cubemap_transfer(scene.tracer, receivers, edge, samples))
+            between = time.process_time()
+            elements = TexelElements(scene.tracer, receivers, edge, samples)
+            positions = scene.positions(part)
+            found = drain(sparse_transfer(elements, positions, receivers.normals, sparse_settings(positions, 1)))
+            ended = time.process_time()
+            rows.append([f"{name} {part}, 6 x {edge} x {edge}", samples ** 2, 100 * found.sampled, between - started,
+                         ended - between, (between - started) / (ended - between),
+                         *errors(truth, found.transfer, light)])
+            print(rows[-1], flush=True)
+    print_table(["", "rays a texel", "all elements %", "all s", "sparse s", "gain", "element error %",
+                 *(f"{world} %" for world in WORLDS)], rows)
+
+
+def metal_ring() -> ObjectMesh:
+    """An open ring of metal that stands on the ground, smooth, round the origin."""
+    angle = np.arange(RING_SEGMENTS) * 2 * np.pi / RING_SEGMENTS
+    circle = RING_RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    low, after = np.arange(RING_SEGMENTS), (np.arange(RING_SEGMENTS) + 1) % RING_SEGMENTS
+    points = np.concatenate([np.column_stack([circle, np.full(RING_SEGMENTS, z)]) for z in (0.01, RING_HEIGHT)])
+    triangles = np.concatenate([np.stack([low, low + RING_SEGMENTS, after], axis=1),
+                                np.stack([after, low + RING_SEGMENTS, after + RING_SEGMENTS], axis=1)])
+    return smooth_object("ring", points, triangles.astype(np.int32), (0.9,) * 3)
+
+
+def caustic(name: str, arguments: argparse.Namespace) -> None:
+    """Caustics of a metal ring on the ground: elements by paths, sparsely and all of them, and paths that follow the
+    lobe, which carry all columns at once. name is not used."""
+    del name
+    line = (np.arange(CAUSTIC_SIDE) / (CAUSTIC_SIDE - 1) - 0.5) * 2.4
+    x, y = np.meshgrid(line, line, indexing="ij")
+    first = (np.arange(CAUSTIC_SIDE - 1)[:, None] * CAUSTIC_SIDE + np.arange(CAUSTIC_SIDE - 1)).ravel()
+    quads = np.stack([first, first + CAUSTIC_SIDE, first + CAUSTIC_SIDE + 1, first + 1], axis=1)
+    triangles = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]).astype(np.int32)
+    floor = smooth_object("floor", np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), triangles, (ALBEDO,) * 3)
+    mesh = SceneMesh.assemble([floor, metal_ring()])
+    tracer, count = Tracer(mesh.points, mesh.triangles, arguments.threads), x.size
+    receivers = ReceiverSet.of_keys(mesh, tracer, np.arange(count))
+    lobe = PrincipledLobe(SurfaceMaterial("metal", (0.9,) * 3, roughness=RING_ROUGHNESS, metallic=1.0))
+    glossy = GlossySurfaces(lobe, np.arange(len(mesh.points)) >= count)
+    edge, light = arguments.edge, world_lights(arguments.edge)
+    reference = drain(gathered_caustics(tracer, mesh, receivers, glossy, edge, 1 << 14, BOUNCES, 99))
+    rows = []
+
+    def show(way: str, share: float, found: NDArray[np.float32], seconds: float, truth: NDArray[np.float32]) -> None:
+        rows.append([way, 100 * share, seconds, *errors(truth, found, light), errors(reference, found, light)[1]])
+        print(rows[-1], flush=True)
+
+    for paths in (64, 256, 1024):
+        started = time.process_time()
+        found = drain(gathered_caustics(tracer, mesh, receivers, glossy, edge, paths, BOUNCES))
+        show(f"{paths} paths that follow the lobe", 1.0, found, time.process_time() - started, reference)
+    elements = CausticElements(tracer, mesh, receivers, glossy, edge, CAUSTIC_PATHS, BOUNCES)
+    started = time.process_time()
+    every = np.empty((elements.columns, count), np.float32)
+    for column in range(elements.columns):
+        every[column] = elements.evaluate(np.arange(count), np.full(count, column))
+    every *= elements.factor(np.zeros(1, np.int64)).T
+    show(f"every element, {CAUSTIC_PATHS} paths", 1.0, every, time.process_time() - started, reference)
+    for angular in (False, True):
+        elements = CausticElements(tracer, mesh, receivers, glossy, edge, CAUSTIC_PATHS, BOUNCES, angular=angular)
+        started = time.process_time()
+        settings = SparseSettings(radius=CAUSTIC_RADIUS, adding_up=0.0, dense=0.25 if not angular else 0.15)
+        found = drain(sparse_transfer(elements, mesh.points[receivers.key], receivers.normals, settings))
+        way = "sparse, " + ("two passes" if angular else "a quarter of the texels")
+        show(way, found.sampled, found.transfer, time.process_time() - started, every)
+    print_table([f"6 x {edge} x {edge}, {count} vertices", "elements %", "processor s", "element error %",
+                 *(f"{world} %" for world in WORLDS), f"{WORLDS[0]} % against 16,384 paths"], rows)
+
+
 PARTS = {"direct": direct, "radius": radius, "full": full, "encode": encoders, "indirect": indirect, "glossy": glossy,
-         "pays": pays}
+         "pays": pays, "caustic": caustic, "bake": bake_texels}
 
 
 def main() -> None:

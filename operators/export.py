@@ -7,13 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
+from numpy.typing import NDArray
 
 from ..prt_addon.errors import BadArguments, PRTError, StorageError
 from ..prt_addon.storage.container import BakedTransfer
 from ..prt_addon.storage.files import save_arrays, save_json
 from .arguments import path_of
+from .export_atlas import FILES, export_atlases, file_name
 from .polls import refuse, why_not_read
-from .relit import read_all
+from .relit import Lit, read_all, relit
 
 # What is written of each object, described for whoever reads it without this program.
 ARRAYS = {
@@ -33,6 +35,8 @@ ARRAYS = {
     "kernels": "(materials, functions, n^2, 1 or 3) float32: rows 1, 2, ... of a lamp's direct light are kernel . "
                "y(direction to the lamp in the point's frame) times its E / pi; share and dimming of the diffuse row "
                "are in the header's lamp_surfaces",
+    "texel_column": "(points,) int32: of each texel in its atlas; only of bakes at texels, whose header has an atlas",
+    "texel_row": "(points,) int32, row 0 the lowest",
 }
 
 
@@ -42,35 +46,42 @@ def check_folder(folder: Path) -> None:
         raise BadArguments(str(folder), "it is a file", "Give a folder")
 
 
-def export_bakes(baked: dict[str, BakedTransfer], folder: Path) -> Iterator[Path]:
+def export_bakes(baked: dict[str, BakedTransfer], folder: Path, lit: Lit) -> Iterator[Path]:
     """Write per object an .npz of everything stored, and baked.json that describes them; the paths as they are done.
 
-    Raises StorageError where the folder can't be made or written.
+    lit: the light of now, for the lightmaps of bakes at texels (`export_atlas`). Raises StorageError where the folder
+    can't be made or written.
     """
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise StorageError(str(folder), f"can't be made ({error.strerror})", "Choose another folder") from error
-    written = {array: text for array, text in ARRAYS.items()
-               if any(getattr(transfer, array) is not None for transfer in baked.values())}
+    arrays = {name: _arrays_of(transfer) for name, transfer in baked.items()}
+    written = {array: text for array, text in ARRAYS.items() if any(array in found for found in arrays.values())}
     index = {"format": "prt", "schema": 1, "arrays": written, "objects": []}
+    if any(transfer.texels is not None for transfer in baked.values()):
+        index["atlases"] = {f"NUMBER_NAME_{file}": text for file, text in FILES.items()}
     for number, (name, transfer) in enumerate(baked.items()):
-        path = folder / f"{number:04d}_{_file_name(name)}.npz"
-        save_arrays(path, {array: getattr(transfer, array) for array in ARRAYS
-                           if getattr(transfer, array) is not None})
+        path = folder / f"{number:04d}_{file_name(name)}.npz"
+        save_arrays(path, arrays[name])
         index["objects"].append({"name": name, "file": path.name, "header": transfer.header})
         yield path
+    yield from export_atlases(baked, folder, lit)
     save_json(folder / "baked.json", index)
     yield folder / "baked.json"
 
 
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:80]
+def _arrays_of(baked: BakedTransfer) -> dict[str, NDArray]:
+    """What is written of a bake."""
+    texels = {} if baked.texels is None else {"texel_column": baked.texels.column, "texel_row": baked.texels.row}
+    own = {array: getattr(baked, array, None) for array in ARRAYS}
+    return {array: values for array, values in own.items() if values is not None} | texels
 
 
 class PRT_OT_export(bpy.types.Operator):
     """Write the bakes of all objects into a folder, as arrays (.npz) and a description (baked.json) that say all a game
-    engine needs to relight them. Costs as much disk as the bakes take in this file"""
+    engine needs to relight them; of objects baked at texels also their light and weights as pictures (.exr) and
+    their surface with UVs (.obj). Costs as much disk as the bakes take in this file"""
 
     bl_idname = "prt.export"
     bl_label = "Export Bakes"
@@ -95,9 +106,11 @@ class PRT_OT_export(bpy.types.Operator):
                 raise BadArguments("Export", "no folder is given", "Give directory=")
             folder = path_of(self.directory)
             check_folder(folder)
-            written = list(export_bakes(read_all(context.scene, context.scene.name), folder))
+            baked = read_all(context.scene, context.scene.name)
+            for _ in export_bakes(baked, folder, relit(context.scene, baked)):
+                pass
         except PRTError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Exported {len(written) - 1} object{'' if len(written) == 2 else 's'} to {folder}")
+        self.report({"INFO"}, f"Exported {len(baked)} object{'' if len(baked) == 1 else 's'} to {folder}")
         return {"FINISHED"}

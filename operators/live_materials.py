@@ -178,31 +178,22 @@ class LiveMaterials:
     def _answer(self, found: _Set, shown: Mapping[str, Shown], surfaces: dict[str, EditedSurfaces],
                 lights: Mapping[str, Single], depsgraph: bpy.types.Depsgraph, started: float) -> None:
         """Solve for a set's edits and keep what is to be drawn."""
-        before, found.surfaces = found.surfaces, surfaces
+        found.surfaces = surfaces
         if not any(one.changed for one in surfaces.values()):
             for name in found.starts:
                 self.edited.pop(name, None)
-            self.message = ""
+            self.message, self.answers = "", self.answers + 1
             return
-        points = max(start + len(shown[name].baked.positions) for name, start in found.starts.items() if name in shown)
-        baked_row = np.zeros((points, 3), np.float32)
-        change, emission = (np.zeros_like(found.edits.operator.albedo) for _ in range(2))
-        for name, start in found.starts.items():
-            if name in shown and name in lights:
-                place = slice(start, start + len(shown[name].baked.positions))
-                baked_row[place] = _diffuse_row(shown[name], lights[name])
-                if name in surfaces:
-                    change[place] = surfaces[name].albedo - shown[name].baked.albedo
-                    emission[place] = surfaces[name].emission
+        baked_row, change, emission = _what_changed(found, shown, surfaces, lights)
         before_glow = time.perf_counter()
-        glow = self._glow(found, shown, surfaces, points, depsgraph)
+        glow = self._glow(found, shown, surfaces, len(baked_row), depsgraph)
         started += time.perf_counter() - before_glow  # traced once: what follows shall not wait as long
         added, solution = found.edits.added(change, emission, found.edits.arriving(baked_row), glow)
         found.versions += 1
         for name, start in found.starts.items():
             if name in shown:
                 mine = added[start:start + len(shown[name].baked.positions)]
-                self._keep(name, shown[name], mine, surfaces.get(name), before.get(name), found.versions)
+                self._keep(name, shown[name], mine, surfaces.get(name), found.versions)
         self.seconds, self.answers = time.perf_counter() - started, self.answers + 1
         self.message = (f"Bounced light follows materials: {TITLES[solution.method]}, "
                         f"{plural(solution.iterations, 'iteration', 'iterations')}, "
@@ -244,8 +235,7 @@ class LiveMaterials:
             self._tracer = key, Tracer(points, scene.triangles, threads=1)
         return self._tracer[1]
 
-    def _keep(self, name: str, item: Shown, added: Single, now: EditedSurfaces | None, before: EditedSurfaces | None,
-              version: int) -> None:
+    def _keep(self, name: str, item: Shown, added: Single, now: EditedSurfaces | None, version: int) -> None:
         """What is drawn of one object."""
         albedo, glow = (item.baked.albedo, None) if now is None else (now.albedo, now.emission)
         values = np.zeros((len(added), item.baked.bases.shape[2], 3), np.float32)
@@ -263,13 +253,30 @@ class LiveMaterials:
         self.edited[name] = Edited(replace(item.baked, albedo=albedo), (item.key, "edited", version), values)
 
 
+def _what_changed(found: _Set, shown: Mapping[str, Shown], surfaces: dict[str, EditedSurfaces],
+                  lights: Mapping[str, Single]) -> tuple[Single, Single, Single]:
+    """The baked diffuse row (points, 3) of a set's objects under the present light; change of albedo since the bake and
+    emission (n, 3) of its receivers."""
+    points = max(start + len(shown[name].baked.positions) for name, start in found.starts.items() if name in shown)
+    baked_row = np.zeros((points, 3), np.float32)
+    change, emission = (np.zeros_like(found.edits.operator.albedo) for _ in range(2))
+    for name, start in found.starts.items():
+        if name in shown and name in lights:
+            place = slice(start, start + len(shown[name].baked.positions))
+            baked_row[place] = _diffuse_row(shown[name], lights[name])
+            if name in surfaces:
+                change[place] = surfaces[name].albedo - shown[name].baked.albedo
+                emission[place] = surfaces[name].emission
+    return baked_row, change, emission
+
+
 def _where(edits: MaterialEdits) -> str:
     """Who solved, and why, as a clause."""
     if edits.on_gpu is None:
         return ""
     if edits.used_gpu:
         return " on the GPU"
-    slower = f", {edits.gpu_cost:.1f} times as fast as the GPU here" if edits.gpu_cost > 1.0 else ""
+    slower = f": the GPU takes {edits.gpu_cost:.2g} times as long here" if edits.gpu_cost > 1.0 else ""
     return f" on the CPU{slower}"
 
 

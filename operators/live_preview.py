@@ -432,8 +432,8 @@ def _read_stale() -> None:
     depsgraph = bpy.context.evaluated_depsgraph_get()
     around = surroundings(depsgraph)
     followed = surroundings(depsgraph, follow=True) if _live.materials.present else around
-    if around != _live.around:
-        _live.around = around
+    if followed != _live.around:  # a colour that is followed shadows nothing anew
+        _live.around = followed
         _live.lamps.forget_geometry()
         _live.materials.forget_geometry()
         _live.materials_dirty = True

@@ -77,6 +77,14 @@ SAMPLING_ITEMS = (
                          "for detailed meshes, slower for simple ones. Adds about 1 % of error; the report states it",
      2),
 )
+RECEIVERS_ITEMS = (
+    ("vertices", "Vertices", "Light is kept at the mesh's vertices, and between them on faces longer than Longest "
+                             "Edge. The least data for fine meshes", 0),
+    ("texels", "Texels", "Light is kept in a picture laid over each object, Longest Edge apart: walls of two triangles "
+                         "get fine shadows, and the light can be exported as textures. Costs a little more data, and "
+                         "many small texels on fine or faceted meshes", 1),
+    ("auto", "Automatic", "Texels on objects whose faces are much longer than Longest Edge, vertices on all others", 2),
+)
 TARGET_ITEMS = (
     ("selected", "Selected Objects", "The selected meshes; all that renders show when none is selected", 0),
     ("collection", "Collection", "The meshes of a collection, whatever is selected", 1),
@@ -88,7 +96,7 @@ QUALITY = ("order", "directions", "gather_directions", "bounce_error", "spacing"
            "surface_columns", "cloud_lights", "merge_response")
 # What goes into a bake under its own name.
 OWN_NAMES = (*QUALITY, "glossy_window", "subsurface", "subsurface_links", "coherence", "lamp_basis", "cloud_spacing",
-             "cloud_emission", "distant_basis", "cubemap_size", "sampling", "memory_budget",
+             "cloud_emission", "distant_basis", "cubemap_size", "sampling", "memory_budget", "receivers", "atlas_size",
              "zone_receivers", "fit_order_to_light", "live_editing", "live_entries", "threads", "seed")
 ROUNDING = 1e-6  # of single precision
 
@@ -214,6 +222,15 @@ class PRTSettings(bpy.types.PropertyGroup):
         description="Longest triangle edge as a share of the scene's size; larger triangles get receivers in "
                     "between, on a hidden mesh. Half as long shows sharper shadows on large faces for up to four "
                     "times the cost. 0 leaves meshes as they are",
+    )
+    receivers: EnumProperty(
+        name="Receivers", items=RECEIVERS_ITEMS, default=PRESETS["standard"].receivers,
+        description="Where the baked light is kept",
+    )
+    atlas_size: IntProperty(
+        name="Most Texels", min=8, max=4096, default=PRESETS["standard"].atlas_size,
+        description="Along a side of each object's picture. Where Longest Edge asks for more, texels get coarser. "
+                    "Twice as many cost up to four times the time, memory and data",
     )
     fit_order_to_light: BoolProperty(
         name="Fit Order to Light", default=PRESETS["standard"].fit_order_to_light,

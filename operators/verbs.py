@@ -132,7 +132,8 @@ def export(arguments: argparse.Namespace) -> Iterator[str]:
     check_folder(folder)
     _check_folder(folder.absolute().parent)
     scene = _open(arguments.input)
-    for path in export_bakes(read_all(scene, str(arguments.input)), folder):
+    baked = read_all(scene, str(arguments.input))
+    for path in export_bakes(baked, folder, relit(scene, baked)):
         yield str(path)
 
 

@@ -39,6 +39,7 @@ class PRT_PT_preview(Sidebar, bpy.types.Panel):
         for line in session.viewport_message.splitlines():
             wrapped(layout, context, line, "INFO")
         layout.operator("prt.relight", icon="GROUP_VCOL")
+        layout.operator("prt.light_images", icon="TEXTURE")
 
 
 def _explain(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

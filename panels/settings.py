@@ -36,6 +36,10 @@ class PRT_PT_rays(_Expert, bpy.types.Panel):
         bounced.active = settings.bounces
         bounced.prop(settings, "gather_directions")
         bounced.prop(settings, "bounce_error")
+        column.prop(settings, "receivers")
+        texels = column.column()
+        texels.active = settings.receivers != "vertices"
+        texels.prop(settings, "atlas_size")
         column.prop(settings, "spacing")
         distant = column.column()
         distant.active = settings.lighting != "local"

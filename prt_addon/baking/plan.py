@@ -7,6 +7,7 @@ import math
 import os
 from dataclasses import dataclass
 
+from ..compression.global_frame import axes_bytes, rows_at_once
 from ..lighting.reference_light import ReferenceLight
 from ..scene.needs import Needs, decide
 from ..scene.scene_mesh import SceneMesh
@@ -47,8 +48,8 @@ BYTES_PER_RAY_HIT, BYTES_PER_KEPT_HIT, BYTES_PER_SORTED_HIT = 24, 30, 75
 # The bounces' copies of the transfer in single precision, those of the Krylov solver in double (as twice as many), and
 # copies of the operator besides its own then; of bases, in double precision twice and in single once.
 COPIES_OF_SERIES, COPIES_OF_KRYLOV, BYTES_PER_BASE_VALUE = 5, 24, 20
-# The encoder's rows at once, how often they are held, and the most axes that it looks for (see global_frame.py).
-ENCODED_ROWS, COPIES_OF_ROWS, MOST_AXES = 4096, 4, 1024
+# How often the encoder holds its rows at once, and the most axes that it looks for (see global_frame.py).
+COPIES_OF_ROWS, MOST_AXES = 4, 1024
 # Local lights: the share that is left of them after merging; of what is solved at once, copies of one channel; of
 # blocks of what highlights see of it, the largest temporary array, of which each thread has a few.
 TYPICAL_MERGED_SHARE, LEAST_MERGED_SHARE, COPIES_OF_SOLVED, COPIES_OF_BLOCK = 0.5, 0.2, 6, 3
@@ -265,7 +266,8 @@ def _encoding(settings: BakeSettings, shapes: list[tuple[int, tuple[int, int, in
         values = math.prod(shape)
         bases = most_clusters(settings, count, shape) * (settings.vectors + 1) * values * BYTES_PER_BASE_VALUE
         held = min(4 * count * values, signals)
-        turned = 4 * count * min(values, MOST_AXES) + 4 * COPIES_OF_ROWS * min(count, ENCODED_ROWS) * values
+        turned = 4 * count * min(values, MOST_AXES) + axes_bytes(count, values) \
+            + 4 * COPIES_OF_ROWS * min(count, rows_at_once(values)) * values
         largest = max(largest, held + turned + bases)
     return transfer + signals + max(rows, largest)
 

@@ -229,7 +229,7 @@ def iterate_wide(frame: GlobalFrame, settings: EncoderSettings, enough: float, m
     state = wide_start(frame, settings, monitor)
     work = Work.of(frame, state, settings, monitor)
     error = work.fit(state, state.means.shape[1])
-    for vectors in range(settings.vectors + 1):
+    for vectors in (*range(0, settings.vectors, settings.together), settings.vectors):
         if vectors:
             state.vectors[:] = vectors
             state.resize(state.means.shape[1], vectors + SPARE)

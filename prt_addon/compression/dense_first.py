@@ -25,6 +25,9 @@ from .workers import Workers
 
 # Energy of the dense points that the frame made from them may leave out.
 UNSEEN = 1e-4
+# Vectors added together to the dense points' clusters, which are only a start for the sweeps over all points: a third
+# of the time saved, 0.3 to 0.9 % more error (bunny and its ground, 6 x 16 x 16).
+TOGETHER = 2
 # Sweeps over all points: most of them, and the relative decrease of the squared error below which they end.
 SWEEPS, TOLERANCE = 6, 0.01
 
@@ -44,7 +47,7 @@ def encode_dense_first(signal: NDArray[np.floating], dense: NDArray[np.bool_], j
     with Workers(settings.threads, monitor.tick) as monitor.workers:
         part = global_frame(np.ascontiguousarray(signal[dense]), None, monitor.workers, UNSEEN)
         monitor.unit = part.scale**2
-        few, left_out = classify(part, settings, monitor)
+        few, left_out = classify(part, replace(settings, together=max(TOGETHER, settings.together)), monitor)
         monitor.span(0.6, 0.95)
         frame = _all_points(signal, part, monitor.workers)
         number = np.cumsum(dense) - 1

@@ -23,10 +23,10 @@ CHUNK = 4096
 # Values from which on only the leading axes are looked for, how many at first and at most.
 WIDE, FIRST_WIDTH, MOST_WIDTH = 1024, 256, 768
 # Values from which on these are the axes of some points, and their number and the frame's are bounded by so many values
-# (256 MB): highlights in a cubemap's columns. Squares below this share of the largest are rounding.
-VERY_WIDE, MOST_SAMPLED, MOST_FRAME, FEWEST_AXES, NEGLIGIBLE = 1 << 14, 1 << 26, 1 << 25, 64, 1e-10
-# Numbers of a pass' rows.
-MOST_NUMBERS = 1 << 25
+# (as many as a bake keeps bases of): highlights in a cubemap's columns. Squares below this share of the largest are
+# rounding. And the numbers of a pass' rows there.
+VERY_WIDE, MOST_SAMPLED, MOST_FRAME, FEWEST_AXES, NEGLIGIBLE = 1 << 14, 1 << 25, 1 << 24, 64, 1e-10
+MOST_NUMBERS = 1 << 23
 # Points for each value from which the rotation is found.
 ENOUGH_POINTS = 24
 
@@ -57,7 +57,19 @@ class GlobalFrame:
 
 def rows_at_once(values: int) -> int:
     """Rows per pass of a signal of so many values."""
-    return max(1, min(CHUNK, MOST_NUMBERS // max(1, values)))
+    return CHUNK if values <= VERY_WIDE else max(1, MOST_NUMBERS // values)
+
+
+def most_axes(values: int) -> int:
+    """Axes that are looked for of a signal of so many values, at most."""
+    return min(values, MOST_WIDTH) if values <= VERY_WIDE else max(FEWEST_AXES, min(MOST_WIDTH, MOST_FRAME // values))
+
+
+def axes_bytes(points: int, values: int) -> int:
+    """What the axes of a very wide signal take while they are found, about; 0 for others."""
+    if values <= VERY_WIDE:
+        return 0
+    return 40 * most_axes(values) * values + 12 * min(points * values, MOST_SAMPLED)
 
 
 def check_signal(signal: NDArray) -> None:
@@ -224,7 +236,7 @@ def _axes_of_some(wide: _Wide) -> NDArray[np.float32]:
     products = np.zeros((len(places),) * 2)
     for start in range(0, values, CHUNK):
         products += gram(np.ascontiguousarray(rows[:, start:start + CHUNK].T, np.float64))
-    squares, mix = symmetric_eigenpairs(products, max(FEWEST_AXES, min(MOST_WIDTH, MOST_FRAME // values)))
+    squares, mix = symmetric_eigenpairs(products, most_axes(values))
     used = squares > NEGLIGIBLE * max(float(squares[0]), np.finfo(float).tiny)
     used[0] = True
     mix = mix[:, used] / np.sqrt(np.maximum(squares[used], np.finfo(float).tiny))

@@ -26,6 +26,8 @@ class EncoderSettings:
         error by some 4 % in two to three times the time.
     restarts: how many of the paper's random starts to try beside the splits; None lets the signal's size decide, and a
         target_error makes do with the splits.
+    together: vectors that are added together while wide signals are iterated; more end sooner, with a little more
+        error.
     threads: that work at the same time, 0 = one for each core; the result does not depend on it.
     """
 
@@ -38,6 +40,7 @@ class EncoderSettings:
     vectors_limit: int | None = None
     tolerance: float = 0.0075
     restarts: int | None = None
+    together: int = 1
     threads: int = 0
 
     def __post_init__(self) -> None:
@@ -56,6 +59,8 @@ class EncoderSettings:
             raise BadArguments("vectors_limit", "it is below the number of vectors", f"Use {self.vectors} or more")
         if self.restarts is not None and self.restarts < 0:
             raise BadArguments("restarts", f"{self.restarts} is not a number of starts", "Use 0 or more, or None")
+        if self.together < 1:
+            raise BadArguments("together", "no vector is added", "Use 1 or more")
         if self.threads < 0:
             raise BadArguments("threads", f"{self.threads} is not a number of threads", "Use 0 or more")
         if not (math.isfinite(self.tolerance) and self.tolerance >= 0):

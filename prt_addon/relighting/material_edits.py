@@ -49,7 +49,7 @@ class MaterialEdits:
     on_gpu: Solve | None = None
     gpu_cost: float = np.inf
     used_gpu: bool = False
-    _last: Single | None = None
+    _last: tuple[Single, Single] | None = None
     _sums: NDArray[np.float64] | None = None
 
     def arriving(self, baked_row: Single) -> Single:
@@ -75,10 +75,16 @@ class MaterialEdits:
             direct[:len(glow)] = glow
             emission = albedo * direct
         source = (albedo - operator.albedo) * light + emission
-        start = self._last if self._last is not None and np.isfinite(self._last).all() else None
-        found = self._solve(albedo, source, start)
-        self._last = found.radiosity
+        found = self._solve(albedo, source, self._start(source))
+        self._last = source, found.radiosity
         return (direct + sparse_multiply_few(operator.matrix, found.radiosity)) * operator.share[:, None], found
+
+    def _start(self, source: Single) -> Single | None:
+        """The last answer where this one is nearer to it than to none."""
+        if self._last is None or not np.isfinite(self._last[1]).all():
+            return None
+        moved = float(np.sum(np.square(source - self._last[0], dtype=np.float64)))
+        return self._last[1] if moved < float(np.sum(np.square(source, dtype=np.float64))) else None
 
     def _solve(self, albedo: Single, source: Single, start: Single | None) -> Radiosity:
         if self._sums is None:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ..errors import BadScene
 from .atlas_cells import AtlasCells
-from .charts import Charts, Double, extents, face_normals
+from .charts import Charts, Double, extents, face_normals, parted
 from .tangents import quiet_pole, smooth_tangents, tangent_frame
 from .unwrapping import SECONDS, make_charts
 
@@ -37,6 +37,7 @@ MOST_TEXELS = 4_000_000
 LARGEST_SIDE = 16384  # of a GPU's picture
 AT_ONCE = 2 ** 20  # pairs of triangles and squares that are looked at in one go
 TOUCH = 1e-7  # texels by which a triangle must reach into a square to touch it
+TRIED = (0.37, 0.61)  # where in a square it is tried whether several triangles lie over each other
 STEPS = 40  # of the search for the finest texels that fit
 
 
@@ -132,9 +133,14 @@ def make_atlas(name: str, points: Double, normals: Double, triangles: NDArray[np
     charts = make_charts(name, points, triangles, method, seconds)
     if not charts.count:
         raise BadScene(name, "no face has an area to lay texels on", "Give its faces an area, or bake at its vertices")
-    texel = _texel_size(name, charts, texel, side, gutter, align)
-    places, width, height = _packed(charts, texel, gutter, align)
-    owner, key = _touched(places, charts.chart, width)
+    asked = texel
+    for _ in range(2):
+        texel = _texel_size(name, charts, asked, side, gutter, align)
+        places, width, height = _packed(charts, texel, gutter, align)
+        owner, key = _touched(places, charts.chart, width)
+        if not (over := overlapping(places, charts.chart, owner, key, width)).any():
+            break
+        charts = parted(charts, over)
     cell_key, cell_of = np.unique(key, return_inverse=True)
     fallback = np.full(len(triangles), -1, np.int64)
     fallback[owner[::-1]] = cell_of.ravel()[::-1]
@@ -148,6 +154,25 @@ def make_atlas(name: str, points: Double, normals: Double, triangles: NDArray[np
     made = _texels(points, normals, tangents, triangles, charts, nearest, texel_key, width)
     made = _with_areas(made, cells, points, triangles, charts)
     return Atlas(width, places, cells, cell_key, fallback, height, texel, made, charts.chart, charts.method)
+
+
+def overlapping(places: Double, chart: NDArray[np.int64], owner: NDArray[np.int64], key: NDArray[np.int64],
+                width: int) -> NDArray[np.bool_]:
+    """(charts,) whether a chart lies over itself, as a spiral ramp seen from above does.
+
+    owner, key: triangles and the squares that they touch. Of a place in each square only one triangle may lie below.
+    """
+    at = np.stack([key % width, key // width], axis=1) + TRIED
+    corners = places[owner]
+    edge = np.roll(corners, -1, axis=1) - corners
+    away = at[:, None] - corners
+    height = edge[..., 0] * away[..., 1] - edge[..., 1] * away[..., 0]
+    deep = TOUCH * 100.0 * np.sqrt(np.sum(edge ** 2, axis=2))
+    inside = np.flatnonzero((height > deep).all(axis=1) | (height < -deep).all(axis=1))
+    _, place, covered = np.unique(key[inside], return_inverse=True, return_counts=True)
+    result = np.zeros(int(chart.max(initial=-1)) + 1, bool)
+    result[chart[owner[inside[covered[place.ravel()] > 1]]]] = True
+    return result
 
 
 def _texel_size(name: str, charts: Charts, texel: float, side: int, gutter: int, align: int) -> float:
@@ -264,7 +289,8 @@ def _nearest(places: Double, owner: NDArray[np.int64], corner_texels: NDArray[np
              width: int) -> _Nearest:
     """owner (n,), corner_texels (n, 4): triangles and the texels around the squares that they touch."""
     # A texel's own triangles come four times; each pair is looked at once.
-    pair = np.unique(np.repeat(owner, 4) * len(texel_key) + corner_texels.ravel())
+    pair = np.sort(np.repeat(owner, 4) * len(texel_key) + corner_texels.ravel())
+    pair = pair[np.concatenate([[True], pair[1:] != pair[:-1]])]
     triangle, texel = pair // len(texel_key), pair % len(texel_key)
     best = np.full(len(texel_key), np.inf)
     result = _Nearest(np.zeros(len(texel_key), np.int64), np.zeros((len(texel_key), 3)), best)

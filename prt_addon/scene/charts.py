@@ -158,3 +158,13 @@ def extents(flat: Double, chart: NDArray[np.int64]) -> tuple[Double, Double]:
     np.minimum.at(low, chart[inside], flat[inside].min(axis=1))
     np.maximum.at(high, chart[inside], flat[inside].max(axis=1))
     return low, high
+
+
+def parted(charts: Charts, which: NDArray[np.bool_]) -> Charts:
+    """The charts, of which some (charts,) fall apart into their triangles: they would lie over themselves."""
+    apart = (charts.chart >= 0) & which[np.maximum(charts.chart, 0)]
+    chart = charts.chart.copy()
+    chart[apart] = charts.count + np.arange(int(apart.sum()))
+    used = chart >= 0
+    chart[used] = np.unique(chart[used], return_inverse=True)[1].ravel()
+    return Charts(chart, charts.flat, charts.method)

@@ -241,8 +241,9 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
                       _point_tangents(beside, normals), False, beside.source)
         if wants_texels(texels, whole, limit.longest):
             made = texel_part(mesh.name, texels, whole, limit.longest)
-            warnings.append(f"{mesh.name}: {len(made.points)} texels in {made.surface.charts} charts of an atlas of"
-                            f" {made.surface.width} x {made.surface.height}")
+            charts = f"{made.surface.charts} chart{'' if made.surface.charts == 1 else 's'}"
+            warnings.append(f"{mesh.name}: {len(made.points)} texels in {charts} of an atlas of"
+                            f" {made.surface.width} x {made.surface.height} ({made.surface.method})")
             return _Part(made.points, made.normals, made.albedo, made.triangles, made.material, made.tangents, False,
                          made.source, made.surface)
     if limit.longest > 0.0:

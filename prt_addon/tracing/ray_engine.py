@@ -32,7 +32,7 @@ MOST_PAIRS = 1 << 24  # of all directions and origins, for the same reason as
 MOST_TRIANGLES = 1 << 23  # whole numbers up to 2^24 are exact in a texture, and three texels each fit into one
 # Windows resets a driver whose dispatch takes 2 s, and a redraw has to wait for the one under way.
 SLICE_SECONDS = 0.025
-FIRST_RAYS, LEAST_RAYS, MOST_RAYS = 1 << 13, 1 << 9, 1 << 21
+FIRST_RAYS, LEAST_RAYS, MOST_RAYS = 1 << 13, 1 << 9, 1 << 20
 # Of a loop of all pairs, in one dispatch: Mesa's software driver ends loops after 65,536 rounds, and bounded work is
 # what keeps slices short.
 MOST_STEPS = 1 << 15

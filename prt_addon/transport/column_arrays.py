@@ -7,6 +7,8 @@ component analysis read whole columns, and each of these is one run of the file.
 
 from __future__ import annotations
 
+import errno
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,12 +36,16 @@ def column_array(columns: int, receivers: int, budget: int | None = None, folder
     if budget is None or size <= budget or not size:
         return np.zeros((columns, receivers), kind)
     try:
+        free = shutil.disk_usage(folder or tempfile.gettempdir()).free
+        if size > free:  # else the file's pages would find no room later, which ends the process
+            raise OSError(errno.ENOSPC, f"{free / 1e9:.1f} GB are free")
         with tempfile.TemporaryFile(dir=folder) as file:
             file.truncate(size)
             return np.memmap(file, kind, "r+", shape=(columns, receivers))
     except OSError as error:
+        remedy = "Free some disk space, or choose a smaller cubemap or fewer glossy_rows"
         raise PRTError(str(folder or tempfile.gettempdir()), f"{size / 1e9:.1f} GB of transfer can't be written there "
-                       f"({error.strerror or error})", "Free some disk space, or choose a smaller cubemap") from error
+                       f"({error.strerror or error})", remedy) from error
 
 
 def column_blocks(columns: int, at_once: int = COLUMNS_AT_ONCE) -> Iterator[slice]:

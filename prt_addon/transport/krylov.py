@@ -31,10 +31,13 @@ def bicgstab_cycle(apply: Apply, solution: Values, residual: Values, size: Value
     products = 0
     for _ in range(CYCLE):
         image = apply(direction)
-        alpha = quotient(rho, dot(shadow, image))
+        # A column that is solved stays: what is left of it is rounding, and steps along that may overflow.
+        moves = column_norm(residual) > 0.25 * tolerance * size
+        alpha = np.where(moves, quotient(rho, dot(shadow, image)), 0.0).astype(solution.dtype)
         half = residual - alpha * image
         half_image = apply(half)
         omega = quotient(dot(half_image, half), dot(half_image, half_image))
+        omega = np.where(moves, omega, 0.0).astype(solution.dtype)
         products += 2
         solution += alpha * direction + omega * half
         residual = half - omega * half_image
@@ -44,7 +47,8 @@ def bicgstab_cycle(apply: Apply, solution: Values, residual: Values, size: Value
         following = dot(shadow, residual)
         if worst <= 0.5 * tolerance or not np.any(following):
             break
-        direction = residual + quotient(following, rho) * quotient(alpha, omega) * (direction - omega * image)
+        onward = quotient(following, rho) * quotient(alpha, omega) * (direction - omega * image)
+        direction = np.where(moves, residual + onward, residual)
         rho = following
     return products
 
@@ -76,4 +80,5 @@ def column_norm(values: Values) -> Values:
 
 def quotient(a: Values, b: Values) -> Values:
     """a / b, and 0 for a column that is solved already (0 / 0)."""
-    return np.divide(a, b, out=np.zeros_like(a), where=b != 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.divide(a, b, out=np.zeros_like(a), where=b != 0.0)

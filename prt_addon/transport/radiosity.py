@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from itertools import count
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,9 @@ RELATIVE_COSTS: Mapping[str, float] = {JACOBI: 1.0, GAUSS_SEIDEL: 1.0, BICGSTAB:
 # Preparing Gauss-Seidel (a triangular factor for each channel), and what a Krylov method does before its first step.
 PREPARATION: Mapping[str, float] = {GAUSS_SEIDEL: 20.0, BICGSTAB: 2.5}
 MOST_ITERATIONS = 5000
+MOST_CYCLES = 10  # of BiCGSTAB: what they do not solve is not to be solved in this precision
+# Of the brightest channel: residuals of a darker one are told relative to this share of it.
+DARKEST_CHANNEL = 1e-3
 # Residuals down to which single precision serves the Krylov methods, too, where the emittance has it.
 SINGLE_TOLERANCE = 1e-5
 
@@ -63,7 +65,17 @@ def solve_radiosity(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], emi
     if method is None:
         # A bound costs nothing where sums are known, an estimate a dozen products: as many as some solutions.
         method = choose_solver(radius_bound(matrix, albedo, sums), tolerance)
-    began = time.perf_counter()
+    found = _iterate(_System(matrix, albedo, emittance, areas, tolerance), method, start, most)
+    if method == BICGSTAB and emittance.dtype == np.float32 and not found.residual <= tolerance:
+        # Single precision was not enough after all.
+        found = _iterate(_System(matrix, albedo, emittance.astype(np.float64), areas, tolerance), method, None, most)
+        found = replace(found, radiosity=found.radiosity.astype(np.float32))
+    return found
+
+
+def _iterate(system: _System, method: str, start: NDArray[np.floating] | None, most: int) -> Radiosity:
+    """Iterate until the residual is small enough, or no number any more."""
+    emittance, began = system.emittance, time.perf_counter()
     steps = {JACOBI: _jacobi, GAUSS_SEIDEL: _gauss_seidel, BICGSTAB: _bicgstab,
              CONJUGATE_GRADIENTS: _conjugate_gradients}[method]
     solution = emittance.copy() if start is None else start.astype(emittance.dtype)
@@ -71,10 +83,10 @@ def solve_radiosity(matrix: sparse.csr_matrix, albedo: NDArray[np.floating], emi
     seconds: list[float] = []
     if not emittance.any():
         return Radiosity(np.zeros_like(emittance), method, 0, 0.0)
-    for solution, residual in steps(_System(matrix, albedo, emittance, areas, tolerance), solution):  # noqa: B007, B020
+    for solution, residual in steps(system, solution):  # noqa: B007, B020
         history.append(residual)
         seconds.append(time.perf_counter() - began)
-        if residual <= tolerance or len(history) >= most or not np.isfinite(residual):
+        if residual <= system.tolerance or len(history) >= most or not np.isfinite(residual):
             break
     return Radiosity(solution.astype(emittance.dtype, copy=False), method, len(history), history[-1], history, seconds)
 
@@ -120,8 +132,10 @@ class _System:
     tolerance: float
 
     def size(self) -> NDArray[np.float64]:
-        """(channels,) norms of the emittance."""
-        return np.maximum(column_norm(self.emittance.astype(np.float64)), SMALLEST)
+        """(channels,) norms of the emittance; of a much darker channel than the brightest as of one not so dark, whose
+        rounding would otherwise never be solved away."""
+        norms = column_norm(self.emittance.astype(np.float64))
+        return np.maximum(norms, max(DARKEST_CHANNEL * float(norms.max(initial=0.0)), SMALLEST))
 
     def residual_of(self, left: NDArray[np.floating]) -> float:
         """Relative residual of the worst channel, of what is left (r, channels)."""
@@ -186,14 +200,14 @@ def _bicgstab(system: _System, values: NDArray[np.floating]) -> Steps:
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values - albedo * sparse_multiply_few(matrix, values)
 
-    for cycle in count():
+    for cycle in range(MOST_CYCLES):
         residual, history = emittance - apply(solution), []
         reached = system.residual_of(residual)
         if cycle or reached <= system.tolerance:
             yield solution, reached
         for _ in bicgstab_cycle(apply, solution, residual, system.size(), system.tolerance, history):
             # Of the last step of a cycle the true residual is told, with the next cycle.
-            if history[-1] > system.tolerance:
+            if not history[-1] <= system.tolerance:
                 yield solution, history[-1]
 
 

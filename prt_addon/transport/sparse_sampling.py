@@ -183,7 +183,7 @@ def _next_dense(scene: _Scene, rank: NDArray[np.int16], number: int) -> Places:
     settings, count = scene.settings, len(scene.elements)
     wanted = round(settings.dense * count * (number + 1) / settings.rounds) - len(scene.dense)
     wanted = max(wanted, 1 if number == 0 and count else 0)
-    if len(scene.dense):  # what a dense vertex has cost so far against what is left
+    if len(scene.dense) and settings.most < 1.0:  # what a dense vertex has cost so far against what is left
         cost = scene.elements.asked / len(scene.dense)
         rest = settings.features * scene.elements.columns
         affordable = (settings.most * count * scene.elements.columns - rest * count) / max(cost - rest, 1.0)

@@ -245,3 +245,22 @@ def test_emission_is_read_of_plain_values(scene: bpy.types.Scene) -> None:
     tree.links.new(node.outputs[0], tree.nodes["Material Output"].inputs["Surface"])
     assert live_materials.emission_of(material) == pytest.approx((1.0, 2.0, 5.0))
     assert live_materials.albedo_of(material) == (0.0, 0.0, 0.0)
+
+
+def test_a_glow_is_traced_once_whatever_colours_are_edited(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    from prt.operators import live_materials as followers
+    traced = []
+    monkeypatch.setattr(followers, "glow_of", lambda *a, trace=followers.glow_of: traced.append(1) or trace(*a))
+    inputs_of(bpy.data.materials["White"])["Emission Strength"].default_value = 2.0
+    follow_materials()
+    first = len(traced)
+    assert first == len(room)
+    inputs_of(bpy.data.materials["White"])["Emission Strength"].default_value = 3.0
+    inputs_of(bpy.data.materials["Left"])["Base Color"].default_value = (0.9, 0.1, 0.05, 1.0)
+    follow_materials()
+    assert len(traced) == first
+    room["Floor"].location.z = -0.5  # shapes and places are another matter
+    follow_materials()
+    room["Floor"].location.z = 0.0
+    follow_materials()
+    assert len(traced) > first

@@ -20,7 +20,8 @@ from tests.core.shapes import box, make, plane, sphere
 
 ENCODERS = ("adaptive", "eigentransport")  # the first works as iterative and static do, first
 SMALL = BakeSettings(distant_basis="cubemap", cubemap_size=4, directions=512, gather_directions=64, clusters=8,
-                     vectors=6, encoder="eigentransport", spacing=0.0, compression_error=0.0, error_receivers=0, threads=1)
+                     vectors=6, encoder="eigentransport", spacing=0.0, compression_error=0.0, error_receivers=0,
+                     threads=1)
 
 
 def baked(meshes, settings=SMALL, light=None):
@@ -134,7 +135,8 @@ def test_duplicated_vertices_are_lit_alike(encoder):
 
 def test_parts_far_apart_are_lit_as_if_alone():
     ball = sphere("ball", subdivisions=2)
-    far = replace(ball, positions=np.concatenate([ball.positions, ball.positions + (500.0, 0.0, 0.0)]),
+    moved = ball.positions + np.array([500.0, 0.0, 0.0])
+    far = replace(ball, positions=np.concatenate([ball.positions, moved]),
                   triangles=np.concatenate([ball.triangles, ball.triangles + len(ball.positions)]),
                   corner_normals=np.concatenate([ball.corner_normals] * 2),
                   corner_albedo=np.concatenate([ball.corner_albedo] * 2))

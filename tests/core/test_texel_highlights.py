@@ -18,12 +18,14 @@ from prt_addon.basis.cubemap import cubemap_directions, cubemap_solid_angles, sa
 from prt_addon.basis.hemisphere import evaluate as hemisphere_values
 from prt_addon.basis.hemisphere import functions_of, gram_matrix
 from prt_addon.basis.spherical_harmonics import evaluate
+from prt_addon.errors import PRTError
 from prt_addon.lighting.cubemap_light import Turn
 from prt_addon.relighting.exit_radiance import view_radiance
 from prt_addon.scene.scene_mesh import SceneMesh
 from prt_addon.scene.surface_material import SurfaceMaterial
 from prt_addon.tracing.tracer import Tracer
 from prt_addon.transport.brdf import reflection_matrix, reflection_of_material
+from prt_addon.transport.column_arrays import column_array
 from prt_addon.transport.cubemap_transfer import cubemap_transfer
 from prt_addon.transport.glossy import GlossySurfaces, filled_rows, surface_frames
 from prt_addon.transport.kernel_window import softened
@@ -265,3 +267,9 @@ def test_wax_in_texels_is_wax_in_harmonics():
     coefficients = (basis * weights[:, None]).T @ smooth_light(directions.reshape(-1, 3))
     ours, theirs = shown(found[0], light), shown(found[1], coefficients)
     assert np.sqrt(np.mean((ours - theirs) ** 2) / np.mean(theirs ** 2)) < 0.01 and theirs.mean() > 0.3
+
+
+def test_what_no_disk_can_hold_is_refused_with_a_remedy(tmp_path):
+    with pytest.raises(PRTError, match="fewer glossy_rows"):
+        column_array(1 << 24, 1 << 24, 0, tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -108,7 +108,7 @@ def test_a_job_bakes_texels_and_its_result_holds_their_atlas(tmp_path):
     floor = plane(size=2.0, albedo=(0.7, 0.3, 0.2))
     block = box("block", (-0.3, -0.4, 0.1), (0.5, 0.1, 0.8))
     scene = SceneMesh.assemble([floor, block], 1 / 30, None, TexelChoice("auto", 64))
-    assert all(scene.surfaces) and "texels in 1 charts" in scene.warnings[0]
+    assert all(scene.surfaces) and "texels in 1 chart of" in scene.warnings[0]
     folder = write_job(tmp_path, scene, QUICK)
     again = read_job(folder)[0]
     assert np.array_equal(again.points, scene.points) and np.array_equal(again.faces, scene.faces)

@@ -41,7 +41,9 @@ SCRIPTS = {
     "changes": ("changes_in_blender.py", "make_views.py"),
     "display": ("display_in_blender.py", "make_display.py"),
     "sky": ("sky_in_blender.py", "make_display.py"),
+    "tracing": ("tracing_in_blender.py", "make_display.py"),
     "editing": ("editing_in_blender.py", "make_editing.py"),
+    "texels": ("texels_in_blender.py", "make_display.py"),
     "bodies": ("bodies_in_blender.py", "make_body.py"),
 }
 RESTARTED = "killed_in_blender.py"  # it ends its Blender, and looks what the next start finds
