@@ -44,7 +44,7 @@ from prt_addon.basis.cubemap import cubemap_solid_angles
 from prt_addon.basis.haar import haar_transform, keep_largest
 from prt_addon.basis.spherical_harmonics import rotate
 from prt_addon.blender.read_scene import read_objects
-from prt_addon.lighting.cubemap_light import Turn, environment_texels
+from prt_addon.lighting.cubemap_light import EnvironmentTexels, Turn, environment_texels
 from prt_addon.lighting.environment import direction_of_pixel, project, world_rotation
 from prt_addon.linear_algebra import multiply
 from prt_addon.relighting.exit_radiance import cluster_constants, exit_radiance
@@ -60,6 +60,7 @@ Double = NDArray[np.float64]
 SUNS = ((30.0, 60.0), (150.0, 40.0), (260.0, 25.0), (320.0, 50.0), None)
 SUN_DEGREES, SUN_TO_SKY = 1.0, 4.0
 HEIGHT, WIDTH = 512, 1024
+TURN = 20.0  # degrees, of the World
 TARGETS = (0.1, 0.03, 0.01)
 CLUSTERS = ((64, 8), (256, 8), (256, 16), (1024, 8), (1024, 24))
 VECTORS = (12, 24, 48, 96, 192)
@@ -305,6 +306,13 @@ def whole_columns(scene: SceneMesh, truth: Truth, size: int, folder: Path, befor
     change = least_seconds(3, lambda: multiply(transfer, turn(one).astype(np.float32)))
     rows = [Row(f"columns, {size}", "uncompressed", transfer.nbytes, before, change,
                 *truth.errors(radiance(transfer, lights)))]
+    # The same suns by a World that is turned to them, as it is drawn, and by a turn of its texels.
+    back = [EnvironmentTexels.of(sky_and_sun(place and (place[0] - TURN, place[1])), size) for place in SUNS]
+    rotation = world_rotation(-TURN)
+    for name, seen in (("World turned", [kept.turned(rotation) for kept in back]),
+                       ("texels turned", [Turn(size, rotation)(kept.turned()) for kept in back])):
+        rows.append(Row(f"columns, {size}", name, transfer.nbytes, before, change,
+                        *truth.errors(radiance(transfer, seen))))
     root = np.sqrt(cubemap_solid_angles(size))
     seen = [haar_transform(np.ascontiguousarray((light * root[:, None]).T), size).T for light in lights]
     started = time.process_time()

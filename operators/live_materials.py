@@ -276,7 +276,7 @@ def _where(edits: MaterialEdits) -> str:
         return ""
     if edits.used_gpu:
         return " on the GPU"
-    slower = f", {edits.gpu_cost:.1f} times as fast as the GPU here" if edits.gpu_cost > 1.0 else ""
+    slower = f": the GPU takes {edits.gpu_cost:.2g} times as long here" if edits.gpu_cost > 1.0 else ""
     return f" on the CPU{slower}"
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..basis.cubemap import cubemap_solid_angles, texel_of
 from ..basis.spherical_harmonics import evaluate
 from ..lighting.bright_light import BrightCells, bright_texels
-from ..lighting.cubemap_light import Turn, environment_texels, sun_texels
+from ..lighting.cubemap_light import EnvironmentTexels, sun_texels
 from ..lighting.reference_light import ReferenceLight
 from ..lighting.windowing import for_highlights
 from ..linear_algebra import multiply
@@ -95,9 +95,8 @@ class DistantBasis:
         """The light (columns, 3) of these columns."""
         if not self.cubemap:
             return light.coefficients(self.order)
-        total = environment_texels(light.image, self.cubemap)
-        if light.is_turned:  # as it is drawn, a turn's blur included
-            total = Turn(self.cubemap, light.rotation)(total)
+        # As it is drawn, a turn's blur included.
+        total = EnvironmentTexels.of(light.image, self.cubemap).turned(light.rotation)
         for direction, irradiance, angle in zip(light.sun_directions, light.sun_irradiance, light.sun_angles,
                                                 strict=True):
             total = total + sun_texels(direction, irradiance, float(angle), self.cubemap)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..basis.spherical_harmonics import rotate
 from ..lighting.analytic import sun
-from ..lighting.cubemap_light import Turn, sun_texels
+from ..lighting.cubemap_light import sun_texels
 from ..lighting.distant_light import DistantLight
 from ..lighting.environment import apply_bands, band_energies, world_rotation
 from ..lighting.reference_light import ReferenceLight
@@ -88,10 +88,7 @@ def light_texels(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, size: i
     environment = _environment(scene, depsgraph, environment_override)
     warnings = list(environment.warnings)
     rotation = world_rotation(rotate_degrees) @ environment.rotation  # small
-    texels = environment.projected.texels(size)
-    if np.abs(rotation - np.eye(3)).max() > 1e-7:
-        texels = Turn(size, rotation)(texels)
-    texels = texels * environment.scale
+    texels = environment.projected.texels(size).turned(rotation) * environment.scale
     for lamp in read_suns(depsgraph, warnings, name_lamps) if use_scene_lights else ():
         texels = texels + sun_texels(lamp.direction, lamp.irradiance, lamp.angle, size)
     texels = np.ascontiguousarray(texels, np.float64)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BadScene, PRTError
-from ..lighting.cubemap_light import environment_texels
+from ..lighting.cubemap_light import EnvironmentTexels
 from ..lighting.environment import band_energies, check_finite, load_equirectangular, project, total_energy
 from ..lighting.reference_light import reference_image
 from .nodes import constant_of, path_of, reachable, shown_images, signature, source_of
@@ -36,7 +36,7 @@ class ProjectedImage:
     energy: float
     small: NDArray[np.float32]
     make: Callable[[], NDArray[np.float32]]
-    cubemaps: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    cubemaps: dict[int, EnvironmentTexels] = field(default_factory=dict)
 
     @staticmethod
     def of(make: Callable[[], NDArray[np.float32]]) -> ProjectedImage:
@@ -45,12 +45,10 @@ class ProjectedImage:
         return ProjectedImage(project(image, HIGHEST_ORDER), total_energy(image), reference_image(image),
                               make)
 
-    def texels(self, size: int) -> NDArray[np.float64]:
-        """Mean radiance (6 size^2, 3) in the texels of a cubemap, read-only."""
+    def texels(self, size: int) -> EnvironmentTexels:
+        """Mean radiance in the texels of a cubemap, to be turned."""
         if size not in self.cubemaps:
-            texels = environment_texels(self.make(), size)
-            texels.setflags(write=False)
-            self.cubemaps[size] = texels
+            self.cubemaps[size] = EnvironmentTexels.of(self.make(), size)
         return self.cubemaps[size]
 
     def truncation(self, order: int) -> float:

@@ -8,6 +8,7 @@ radiance times solid angle is that of the source, however small and bright it is
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,15 +52,61 @@ def environment_texels(image: NDArray[np.floating], r: int, rotation: ArrayLike 
     of relit scenes 15 to 30 % larger (benchmarks/all_frequency.py). rotation: R (3, 3) of the environment,
     f(R^-1 s).
     """
+    _check_image(image)
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+    rest, directions, flux = _without_suns(image)
+    texels = _box_filtered(rest, r, None if rotation is None else turn)
+    return _with_suns(texels, directions, flux, r, turn)
+
+
+def _without_suns(image: NDArray[np.floating]) -> tuple[NDArray[np.floating], Array, Array]:
+    """The image without the pixels of suns, and the directions (k, 3) and fluxes (k, 3) of these."""
+    bright, rest = bright_pixels(image, np.eye(3), 0)
+    if bright is None:
+        return rest, np.empty((0, 3)), np.empty((0, 3))
+    directions, solid_angles = bright.place(bright.cells, np.full((len(bright.cells), 2), 0.5))
+    return rest, directions, bright.radiance * solid_angles[:, None]
+
+
+def _with_suns(texels: Array, directions: Array, flux: Array, r: int, turn: Array) -> Array:
+    """Texels (6 r r, 3) and the suns' pixels, turned by R (3, 3)."""
+    if not len(flux):
+        return texels
+    turned = np.sum(directions[:, None, :] * turn, axis=2)
+    return texels + _shared(turned, flux, r) / cubemap_solid_angles(r)[:, None]
+
+
+@dataclass(frozen=True)
+class EnvironmentTexels:
+    """An environment's texels, made once, that turn within milliseconds: what is broad by `Turn`, the pixels of suns
+    themselves, so that no turn blurs their shadows.
+
+    r: texels along an edge; broad: (6 r r, 3); directions, flux: (k, 3) of the suns' pixels.
+    """
+
+    r: int
+    broad: Array
+    directions: Array
+    flux: Array
+
+    @staticmethod
+    def of(image: NDArray[np.floating], r: int) -> EnvironmentTexels:
+        """Of an equirectangular image (height, width, 3). Raises ValueError where it has another shape."""
+        _check_image(image)
+        rest, directions, flux = _without_suns(image)
+        return EnvironmentTexels(r, _box_filtered(rest, r, None), directions, flux)
+
+    def turned(self, rotation: ArrayLike | None = None) -> Array:
+        """Mean radiance (6 r r, 3) of f(R^-1 s)."""
+        turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        straight = np.abs(turn - np.eye(3)).max() < 1e-7
+        broad = self.broad if straight else Turn(self.r, turn)(self.broad)
+        return _with_suns(broad, self.directions, self.flux, self.r, turn)
+
+
+def _check_image(image: NDArray[np.floating]) -> None:
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"an environment must be a (height, width, 3) array, not {image.shape}")
-    turn = None if rotation is None else np.asarray(rotation, np.float64)
-    bright, rest = bright_pixels(image, np.eye(3) if turn is None else turn, 0)
-    texels = _box_filtered(rest, r, turn)
-    if bright is None:
-        return texels
-    middles, solid_angles = bright.place(bright.cells, np.full((len(bright.cells), 2), 0.5))
-    return texels + _shared(middles, bright.radiance * solid_angles[:, None], r) / cubemap_solid_angles(r)[:, None]
 
 
 def _box_filtered(image: NDArray[np.floating], r: int, turn: Array | None) -> Array:

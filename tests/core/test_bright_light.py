@@ -15,7 +15,7 @@ from prt_addon.baking.settings import BakeSettings
 from prt_addon.basis.cubemap import cubemap_solid_angles, texel_of
 from prt_addon.basis.directions import random_rotation
 from prt_addon.lighting.bright_light import bright_pixels, bright_texels, is_sharp
-from prt_addon.lighting.cubemap_light import Turn, environment_texels, sun_texels
+from prt_addon.lighting.cubemap_light import EnvironmentTexels, sun_texels
 from prt_addon.lighting.environment import direction_of_pixel, pixel_of_direction, project, world_rotation
 from prt_addon.lighting.reference_light import ReferenceLight
 from prt_addon.scene.scene_mesh import SceneMesh
@@ -179,7 +179,7 @@ def test_a_turned_reference_is_the_turned_image_and_its_texels_are_those_drawn()
     straight = ReferenceLight.of(image, None, [], "straight")
     assert np.array_equal(light.radiance(directions), straight.radiance(directions @ rotation))
     assert np.allclose(light.coefficients(4), project(image.astype(np.float32), 4, rotation), rtol=1e-5, atol=1e-5)
-    drawn = Turn(8, rotation)(environment_texels(image.astype(np.float32), 8))
+    drawn = EnvironmentTexels.of(image.astype(np.float32), 8).turned(rotation)
     assert np.allclose(DistantBasis(0, 8).coefficients(light), drawn, rtol=1e-9)
     again = ReferenceLight.from_arrays(light.arrays(), light.header())
     assert np.array_equal(again.rotation, rotation) and np.array_equal(again.image, light.image)

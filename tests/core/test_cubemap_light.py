@@ -13,6 +13,7 @@ from prt_addon.basis.directions import random_rotation
 from prt_addon.basis.spherical_harmonics import evaluate
 from prt_addon.lighting import analytic, environment
 from prt_addon.lighting.cubemap_light import (
+    EnvironmentTexels,
     Turn,
     bilinear_look_up,
     constant_texels,
@@ -80,6 +81,22 @@ def test_a_sun_of_a_few_pixels_keeps_its_place_within_a_texel(r):
         assert np.allclose(found / found.sum(), lamp / lamp.sum(), atol=1e-3)
         moment = (found[:, 0] * cubemap_solid_angles(r)) @ cubemap_directions(r)
         assert np.arccos(moment @ direction / np.linalg.norm(moment)) < 0.05 * angular_size(r)
+
+
+def test_a_turn_blurs_no_sun_and_is_nearly_the_turned_image():
+    r, image = 16, np.full((64, 128, 3), 0.2)
+    image[20, 37] = 5e3
+    direction = environment.direction_of_pixel(20, 37, 64, 128)
+    kept = EnvironmentTexels.of(image, r)
+    for rotation in (None, environment.world_rotation(33.0), random_rotation(2, 2)):
+        turned, exact = kept.turned(rotation), environment_texels(image, r, rotation)
+        assert np.allclose(total_flux(turned, r), flux_of(image), rtol=1e-9)
+        assert np.abs(turned - exact).max() < 0.01 * exact.max()
+        place = direction if rotation is None else rotation @ direction
+        lamp = sun_texels(place, [1.0, 1.0, 1.0], 0.0, r)
+        assert (turned[:, 0] > 1.0).sum() == (lamp[:, 0] > 1e-3).sum() <= 4
+        blurred = Turn(r, np.eye(3) if rotation is None else rotation)(kept.turned())
+        assert rotation is None or (blurred[:, 0] > 1.0).sum() > 4
 
 
 def test_environment_texels_agree_with_the_harmonics_of_the_image():
