@@ -22,6 +22,7 @@ Double = NDArray[np.float64]
 STEEPEST = 0.5
 # Area below which a triangle has none: of the largest extent squared, as in object_mesh.clean.
 NO_AREA = 1e-14
+JOININGS = 16  # rounds in which small charts join larger ones
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,10 @@ def projected_charts(points: Double, triangles: NDArray[np.integer]) -> Charts:
     usable = areas > NO_AREA * float(np.ptp(points[triangles], axis=(0, 1)).max(initial=0.0)) ** 2
     # A little off the axes, so that the corners of a regular solid's faces do not lie between two of them.
     axis = np.argmax(np.concatenate([normals, -normals], axis=1) * (1.0 + 1e-6 * np.arange(6)), axis=1)
+    if not usable.any():
+        return Charts(np.full(len(triangles), -1, np.int64), np.zeros((len(triangles), 3, 2)), "projection")
+    axis = _joined_axes(triangles, axis, normals, usable)
     chart = connected(triangles, axis, usable)
-    if not (chart >= 0).any():
-        return Charts(chart, np.zeros((len(triangles), 3, 2)), "projection")
     direction = _mean_direction(normals, areas, chart, axis)
     return Charts(chart, lay_flat(points, triangles, chart, direction), "projection")
 
@@ -66,17 +68,11 @@ def connected(triangles: NDArray[np.integer], label: NDArray[np.integer],
 
     Numbered by the first triangle of each.
     """
-    start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, axis=1).ravel().astype(np.int64)
-    owner = np.repeat(np.arange(len(triangles)), 3)
-    kept = usable[owner]
-    start, end, owner = start[kept], end[kept], owner[kept]
-    count = int(triangles.max(initial=0)) + 1
-    key = (np.minimum(start, end) * count + np.maximum(start, end))
-    order = np.lexsort((owner, label[owner], key))
-    key, owner = key[order], owner[order]
-    joined = np.flatnonzero((key[1:] == key[:-1]) & (label[owner[1:]] == label[owner[:-1]]))
+    first, second = _neighbours(triangles, usable)
+    same = label[first] == label[second]
+    joined = first[same], second[same]
     size = len(triangles)
-    graph = sparse.coo_matrix((np.ones(len(joined), np.int8), (owner[joined], owner[joined + 1])), shape=(size, size))
+    graph = sparse.coo_matrix((np.ones(int(same.sum()), np.int8), joined), shape=(size, size))
     _, piece = connected_components(graph, directed=False)
     result = np.full(size, -1, np.int64)
     _, first, place = np.unique(piece[usable], return_index=True, return_inverse=True)
@@ -84,6 +80,45 @@ def connected(triangles: NDArray[np.integer], label: NDArray[np.integer],
     rank[np.argsort(first, kind="stable")] = np.arange(len(first))
     result[usable] = rank[place.ravel()]
     return result
+
+
+def _neighbours(triangles: NDArray[np.integer], usable: NDArray[np.bool_],
+                ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (e,) of usable triangles that share an edge; at one of several triangles, each with the next."""
+    start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, axis=1).ravel().astype(np.int64)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    kept = usable[owner]
+    start, end, owner = start[kept], end[kept], owner[kept]
+    count = int(triangles.max(initial=0)) + 1
+    key = np.minimum(start, end) * count + np.maximum(start, end)
+    order = np.lexsort((owner, key))
+    key, owner = key[order], owner[order]
+    same = np.flatnonzero(key[1:] == key[:-1])
+    return owner[same], owner[same + 1]
+
+
+def _joined_axes(triangles: NDArray[np.integer], axis: NDArray[np.integer], normals: Double,
+                 usable: NDArray[np.bool_]) -> NDArray[np.integer]:
+    """The axes (t,), of which pieces that lean little enough take a larger neighbour's, the one they share most edges
+    with: fewer charts and rims."""
+    first, second = _neighbours(triangles, usable)
+    first, second = np.concatenate([first, second]), np.concatenate([second, first])
+    lean = np.stack([np.sum(normals * direction, axis=1) for direction in (*np.eye(3), *-np.eye(3))], axis=1)
+    axis = axis.copy()
+    for _ in range(JOININGS):
+        chart = connected(triangles, axis, usable)
+        count = np.bincount(chart[usable])
+        least = np.full((len(count), 6), 1.0)
+        np.minimum.at(least, chart[usable], lean[usable])
+        own, other, wanted = chart[first], chart[second], axis[second]
+        larger = (count[other] > count[own]) | ((count[other] == count[own]) & (other < own))
+        good = (own != other) & larger & (least[own, wanted] > STEEPEST)
+        votes = np.bincount(own[good] * 6 + wanted[good], minlength=6 * len(count)).reshape(-1, 6)
+        moved = usable & (votes.max(axis=1, initial=0) > 0)[np.maximum(chart, 0)]
+        if not moved.any():
+            break
+        axis[moved] = votes.argmax(axis=1)[chart[moved]]
+    return axis
 
 
 def _mean_direction(normals: Double, areas: Double, chart: NDArray[np.int64], axis: NDArray[np.integer]) -> Double:
