@@ -87,8 +87,7 @@ class LiveScattering:
         """Passes one and two: radiance (p, 3) that leaves each receiver for E / pi (p, 3) that enters; 0 where a
         receiver is not translucent."""
         means = self.pyramid.means(light)
-        if not self._matrices:  # not needed where a graphics card gathers
-            self._matrices = _matrices(unpacked_links(self.links.texels), len(means))
+        self._prepare()
         values = np.concatenate([means[:, None], self.pyramid.moments(means)], axis=1).reshape(-1, 3)
         result = np.zeros((self._points, 3), np.float32)
         for channel, matrix in enumerate(self._matrices):
@@ -99,6 +98,7 @@ class LiveScattering:
     def added(self, direct: Single, bounced: Single | None) -> Single:
         """Pass three: what is to be added to the exit radiance, (p, rows, 3), for the direct light of lamps (p, rows,
         3), with their bounced light (p, 3), which is in the diffuse row already, or None."""
+        self._prepare()
         started = time.perf_counter()
         light = direct[:, 0] if bounced is None else direct[:, 0] + bounced
         result = direct.copy()
@@ -106,6 +106,11 @@ class LiveScattering:
         result[:, self.row] += self.factor * self.scattered(light)
         self.seconds = min(self.seconds, time.perf_counter() - started)
         return result
+
+    def _prepare(self) -> None:
+        """The matrices, which nothing needs where a graphics card gathers from the first."""
+        if not self._matrices:
+            self._matrices = _matrices(unpacked_links(self.links.texels), len(self.pyramid.area))
 
     @property
     def prefers_card(self) -> bool:
