@@ -32,7 +32,7 @@ from prt_addon.storage.files import intact
 from tests.blender.cycles import use_cycles
 
 SUN = measured.SUNS[1]
-CUBEMAP, WIDTH, HEIGHT, GAP, LINE = 32, 360, 270, 8, 24
+CUBEMAP, WIDTH, HEIGHT, GAP, LINE = 32, 272, 204, 8, 24
 PAPER, INK, TEXT = 28, (0.9, 0.9, 0.9), 16
 Double = NDArray[np.float64]
 
@@ -41,8 +41,8 @@ def add_camera(size: float) -> None:
     """Looking down at the mesh and its shadow."""
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     bpy.context.scene.collection.objects.link(camera)
-    camera.location = Vector((0.2, -1.75, 1.45)) * size
-    camera.rotation_euler = (Vector((0.15, -0.1, 0.3)) * size - camera.location).to_track_quat("-Z", "Y").to_euler()
+    camera.location, camera.data.lens = Vector((0.3, -1.9, 2.0)) * size, 42.0
+    camera.rotation_euler = (Vector((0.25, 0.05, 0.25)) * size - camera.location).to_track_quat("-Z", "Y").to_euler()
     scene = bpy.context.scene
     scene.camera = camera
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = WIDTH, HEIGHT, 100
@@ -133,7 +133,11 @@ def main() -> None:
              ("eigentransport, d = 48", lambda: relit_by(
                  scene, names, {"encoder": "eigentransport", "vectors": 48}, job)),
              ("harmonics of order 10", lambda: relit_by(scene, names, {}, None))]
-    bpy.context.scene.world = bpy.data.worlds.new("black")  # the image of the other is gone
+    world = bpy.data.worlds.new("behind")  # what lies below the horizon; the image of the other is gone
+    if world.node_tree is None:
+        world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.12, 0.15, 0.195, 1.0)
+    bpy.context.scene.world = world
     for number, (caption, found) in enumerate(cases):
         kept = options.folder / f"picture{number}.npz"
         if not kept.exists():
@@ -156,6 +160,13 @@ def save_sheet(path: Path, views: list[tuple[str, NDArray[np.uint8]]]) -> None:
         sheet[top:top + HEIGHT, left:left + WIDTH] = view
         texts.append((caption, left, top + HEIGHT + LINE - 6, TEXT))
     write_picture(path, lettered(sheet, texts, INK))
+    small = bpy.data.images.load(str(path))
+    small.colorspace_settings.name = "Non-Color"
+    bpy.context.scene.view_settings.view_transform = "Raw"
+    bpy.context.scene.view_settings.exposure = 0.0
+    bpy.context.scene.render.image_settings.compression = 100
+    bpy.context.scene.render.image_settings.color_mode = "RGB"
+    small.save_render(str(path))
 
 
 if __name__ == "__main__":

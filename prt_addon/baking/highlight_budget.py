@@ -97,6 +97,8 @@ def highlight_budget(surfaces: TrueSurfaces, sample: HighlightSample, light: Ref
     frames = surface_frames(scene.normals[sample.keys], scene.tangents[sample.keys])
     generator = np.random.Generator(np.random.PCG64([seed, 79]))
     views = cosine_directions(lattice(len(sample.keys), VIEWS, generator)).reshape(-1, VIEWS, 3)
+    # Its rays meet the environment by chance alone: pixels must not be too small for that.
+    light = light.coarse()
     task = Measurement(surfaces, receivers, frames, views, light, basis, bounces, (recorded, ALL_HITS), paths, seed,
                        soft)
     before = tracer.rays

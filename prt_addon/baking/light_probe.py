@@ -13,7 +13,7 @@ top in a bake, so that its own error of the basis is as large or somewhat smalle
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from ..basis.directions import disc_directions, tangent_frames
 from ..basis.point_sets import fibonacci_square
 from ..basis.spherical_harmonics import evaluate
 from ..lighting.analytic import sun
-from ..lighting.cubemap_light import sun_texels
+from ..lighting.bright_light import is_sharp
+from ..lighting.cubemap_light import shared, sun_texels
 from ..lighting.environment import direction_of_pixel
 from ..lighting.reference_light import ReferenceLight
 from ..linear_algebra import multiply
@@ -94,6 +95,7 @@ def probe_light(scene: SceneMesh, tracer: Tracer, light: ReferenceLight, shadow_
 
 def _parts(light: ReferenceLight) -> _Light:
     """The light's even part and its small sources."""
+    light = light.coarse()
     height, width = light.image.shape[:2]
     edges = np.cos(np.arange(height + 1) * np.pi / height)
     solid_angle = np.repeat((edges[:-1] - edges[1:]) * (2.0 * np.pi / width), width)
@@ -104,9 +106,10 @@ def _parts(light: ReferenceLight) -> _Light:
     row, column = brightest // width, brightest % width
     directions = direction_of_pixel(row[:, None, None] + steps[:, None], column[:, None, None] + steps[None, :], height,
                                     width).reshape(-1, 3)
+    directions = np.sum(directions[:, None, :] * light.rotation, axis=2)
     rest = light.image.copy()
     rest.reshape(-1, 3)[brightest] = 0.0
-    even = ReferenceLight(rest, light.sun_directions, light.sun_irradiance, light.sun_angles, "")
+    even = replace(light, image=rest)
     samples = even.radiance(sample_directions(FINE, 2).reshape(-1, 3)).reshape(-1, 4, 3)
     return _Light(samples.mean(axis=1), directions, np.repeat(flux, SAMPLES ** 2, axis=0), light)
 
@@ -156,7 +159,10 @@ def _texels(parts: _Light, r: int) -> Double:
     part, solid_angles = FINE // r, cubemap_solid_angles(r)
     flux = (parts.even * cubemap_solid_angles(FINE)[:, None]).reshape(6, r, part, r, part, 3).sum(axis=(2, 4))
     flux = flux.reshape(-1, 3)
-    np.add.at(flux, texel_of(parts.directions, r), parts.flux)
+    if is_sharp(parts.suns.image):
+        flux = flux + shared(parts.directions, parts.flux, r)  # as a bake's light does
+    else:
+        np.add.at(flux, texel_of(parts.directions, r), parts.flux)
     total, suns = flux / solid_angles[:, None], parts.suns
     for direction, irradiance, angle in zip(suns.sun_directions, suns.sun_irradiance, suns.sun_angles, strict=True):
         total = total + sun_texels(direction, irradiance, float(angle), r)

@@ -188,6 +188,9 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
     if material.is_translucent and is_used and not settings.subsurface:
         left_out.append(LeftOut(f"subsurface light of material {material.name}", "subsurface is false",
                                 "the subsurface stage and three channels"))
+    if material.is_translucent and is_used and settings.local_light and not settings.subsurface_links:
+        left_out.append(LeftOut(f"light of lamps through material {material.name}", "subsurface_links is 0",
+                                "16 bytes per point and link"))
     through = 1.0 - material.subsurface_weight if translucent else 1.0
     inside = material.subsurface_weight * (1.0 - material.metallic)
     if functions is None:

@@ -73,7 +73,7 @@ def _with_suns(texels: Array, directions: Array, flux: Array, r: int, turn: Arra
     if not len(flux):
         return texels
     turned = np.sum(directions[:, None, :] * turn, axis=2)
-    return texels + _shared(turned, flux, r) / cubemap_solid_angles(r)[:, None]
+    return texels + shared(turned, flux, r) / cubemap_solid_angles(r)[:, None]
 
 
 @dataclass(frozen=True)
@@ -169,11 +169,11 @@ def sun_texels(direction_to_light: ArrayLike, irradiance: ArrayLike, angle: floa
         count = _DISC_SAMPLES * math.ceil((angle / angular_size(r)) ** 2)
         numbers = (fibonacci_square(min(count, _MOST_DISC_SAMPLES)) + 1.0) * 0.5
         samples, _ = disc_directions(tangent_frames(samples)[0], angle, numbers)
-    share = _shared(samples, np.full((len(samples), 1), 1.0 / len(samples)), r)
+    share = shared(samples, np.full((len(samples), 1), 1.0 / len(samples)), r)
     return (flux * share / cubemap_solid_angles(r)[:, None]) * np.asarray(irradiance, np.float64)
 
 
-def _shared(directions: Array, values: Array, r: int) -> Array:
+def shared(directions: Array, values: Array, r: int) -> Array:
     """Values (n, k) in directions (n, 3), shared bilinearly between the texels around: (6 r r, k)."""
     texels, weights = bilinear_texels(directions, r)
     return np.stack([np.bincount(texels.ravel(), (weights * column[:, None]).ravel(), texel_count(r))

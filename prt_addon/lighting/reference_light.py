@@ -6,7 +6,7 @@ Unlike coefficients it is bound to no order, so that what an order leaves out ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,10 @@ class ReferenceLight:
     def radiance(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Radiance (n, 3) of the environment, suns left out, in unit directions (n, 3)."""
         return self.looked_up(self.image, directions)
+
+    def coarse(self) -> ReferenceLight:
+        """The same with pixels that paths meet by chance, suns among them."""
+        return replace(self, image=averaged(self.image, REFERENCE_WIDTH))
 
     def looked_up(self, image: NDArray[np.float32], directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n, 3) of an image like the environment's in unit directions (n, 3) of the world."""

@@ -99,7 +99,7 @@ def _x_axis(values: Sequence[float], logarithmic: bool, start: float, end: float
 
 def _short(value: float) -> str:
     """A number on an axis: 2500000 -> "2.5 M"."""
-    for size, letter in ((1e6, " M"), (1e3, " k")):
+    for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if value >= size:
             return f"{value / size:.3g}{letter}"
     return f"{value:.3g}"

@@ -104,11 +104,16 @@ def choose_tracer(calibration: Calibration | None, threads: int) -> TracerChoice
     if calibration is None:
         return TracerChoice(False, "Embree: the GPU's speed at tracing was not measured on this computer")
     embree = calibration.embree_rays * threads / calibration.threads
-    gpu, device = calibration.occluded_rays, calibration.device
+    gpu, device = calibration.occluded_rays, short_name(calibration.device)
     if gpu < LEAST_GAIN * embree:
         return TracerChoice(False, f"Embree: {mega(embree)} here, the GPU {mega(gpu)} ({device}), left out",
                             f"it traces {mega(gpu)} here ({device}) and Embree {mega(embree)}")
     return TracerChoice(True, f"the GPU beside Embree: {mega(gpu)} ({device}), Embree {mega(embree)}")
+
+
+def short_name(device: str) -> str:
+    """A driver's name without its versions and buses: "NVIDIA H200" of "NVIDIA H200/PCIe/SSE2, OPENGL"."""
+    return device.partition("/")[0].partition(" (")[0].partition(",")[0]
 
 
 def mega(rays: float) -> str:

@@ -95,7 +95,7 @@ def cosine_visibility(tracer: Tracer | None, receivers: ReceiverSet, place: slic
     if tracer is not None:
         facing = cosines > 0.0
         rays = int(np.count_nonzero(facing))
-        visible[tracer.occluded_where(receivers.origins[place], directions, facing)] = 0.0
+        np.multiply(visible, ~tracer.occluded_where(receivers.origins[place], directions, facing), out=visible)
     # After tracing, when most pairs near the horizon are known to be dark: of the Buddha's one in seven is left, and
     # weighing all of them before would spare one ray in seven hundred.
     weigh_by_faces(receivers, place, directions, visible)

@@ -22,6 +22,8 @@ FAST = ["--preset", "draft", "--set", "directions=512", "--set", "gather_directi
         "--set", "cubemap_size=8"]
 EIGEN = ["--set", "encoder=eigentransport", "--set", "vectors=100", "--set", "compression_error=0"]
 
+QUICK = ["--set", "glossy_rows=0", "--set", "bounces=0", "--set", "vectors=32", "--set", "error_receivers=0"]
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -161,7 +163,23 @@ def test_preview_draws_what_relight_says(baked: Path, tmp_path: Path) -> None:
     assert tuple(image.size) == (64, 48) and max(image.pixels[:]) > 0.2
 
 
+def test_sparse_samples_relit_as_every_element(scene: Path, tmp_path: Path) -> None:
+    """Through the commands and the file; the report tells how far they may be off."""
+    found = []
+    for way in ("every", "sparse"):
+        output = tmp_path / f"{way}.blend"
+        assert run("bake", "--input", scene, "--output", output, "--report", tmp_path / "r.json", *FAST, *EIGEN,
+                   *QUICK, "--set", f"sampling={way}") == 0
+        found.append(relit(output, tmp_path / "a.npz", "--environment", half_sky(tmp_path / "s.exr"))["radiance"])
+    facts = json.loads((tmp_path / "r.json").read_text())["sampling"]
+    assert facts["traced"] < 0.25 and 0.0 < facts["light_error"] < 0.05
+    power = np.sqrt(np.mean(found[0] ** 2))
+    assert 0.0 < np.sqrt(np.mean((found[1] - found[0]) ** 2)) < (2.0 * facts["light_error"] + 0.01) * power
+    assert run("report", "--input", tmp_path / "r.json", "--output", tmp_path / "r.html") == 0
+    assert "Sparse sampling" in (tmp_path / "r.html").read_text()
+
+
 def test_impossible_settings_end_in_2(scene: Path, tmp_path: Path) -> None:
-    for wrong in ("distant_basis=haar", "cubemap_size=64", "vectors=193"):
+    for wrong in ("distant_basis=haar", "cubemap_size=64", "vectors=193", "sampling=few"):
         assert run("bake", "--input", scene, "--output", tmp_path / "x.blend", "--set", wrong) == 2
     assert not (tmp_path / "x.blend").exists()

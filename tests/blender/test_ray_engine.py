@@ -210,8 +210,8 @@ def test_slices_are_short_and_their_number_does_not_count(device):
             break
     assert len(seen) > 2 and seen[-1] == 60_000 and (np.diff(seen) > 0).all()
     assert (answers != tracer.occluded(origins, directions)).sum() <= 2
-    # A quarter of Windows' two seconds, on two busy cores without a GPU; docs/ray_engine.md has the measured ones.
-    assert engine.record.longest < 0.5
+    # Windows ends a driver after two seconds. On busy cores without a GPU, too; docs/ray_engine.md has what was measured.
+    assert engine.record.longest < 2.0 and engine.record.seconds / engine.record.count < 0.25
 
 
 def test_both_sides_share_the_work_and_keep_its_order(device):

@@ -319,6 +319,7 @@ class Ball:
     albedo: np.ndarray
     bases: np.ndarray
     triangles: np.ndarray
+    faces: None = None
 
 
 def ball_of(material, functions, albedo=0.0):

@@ -14,7 +14,7 @@ from prt_addon.errors import PRTError
 from prt_addon.tracing.bounding_hierarchy import LEAF, STACK, build, node_texels, triangle_texels
 from prt_addon.tracing.ray_buckets import make_buckets, pair_with_cells
 from prt_addon.tracing.ray_calibration import ball_field, field_rays
-from prt_addon.tracing.ray_cost import NEAREST_BYTES, Calibration, choose_tracer, gpu_share
+from prt_addon.tracing.ray_cost import NEAREST_BYTES, Calibration, choose_tracer, gpu_share, short_name
 from prt_addon.tracing.ray_engine import FARTHEST, MOST_STEPS, bits_of, check_rays, make_passes, texels_of_bits
 from prt_addon.tracing.tracer import Tracer
 
@@ -186,6 +186,13 @@ def test_the_gpu_is_chosen_only_where_it_was_measured_faster():
     slow = choose_tracer(replace(KNOWN, occluded_rays=4e5, embree_rays=9.8e6, device="llvmpipe"), 4)
     assert not slow.gpu and slow.why == "Embree: 9.8 Mray/s here, the GPU 0.4 Mray/s (llvmpipe), left out"
     assert slow.left_out == "it traces 0.4 Mray/s here (llvmpipe) and Embree 9.8 Mray/s"
+
+
+def test_names_of_drivers_are_told_short():
+    for long, short in (("NVIDIA H200/PCIe/SSE2, OPENGL", "NVIDIA H200"), ("llvmpipe", "llvmpipe"),
+                        ("llvmpipe (LLVM 22.1.8, 256 bits), VULKAN", "llvmpipe"),
+                        ("AMD Radeon RX 6800 (radeonsi, navi21), OPENGL", "AMD Radeon RX 6800")):
+        assert short_name(long) == short
 
 
 def test_rays_that_lead_nowhere_are_refused():

@@ -80,6 +80,7 @@ def bake_for_lamps() -> Step:
 
 def it_shines_through() -> Step:
     """With the lamp behind it the side in sight is lit, redder than the lamp, and smoothly so."""
+    yield 0.1
     picture = shoot("01_behind")
     middle = pixel(picture, MIDDLE)
     assert middle[0] > 0.05 and middle[0] > 1.5 * middle[2], middle

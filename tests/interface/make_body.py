@@ -19,7 +19,7 @@ def principled(name: str, values: dict[str, object]) -> bpy.types.Material:
 def main(path: str) -> None:
     bpy.ops.wm.read_homefile(use_empty=True)
     scene = bpy.context.scene
-    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=6, radius=0.6, location=(0.0, 0.0, 0.7))
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=5, radius=0.6, location=(0.0, 0.0, 0.7))
     bpy.context.object.name = "Ball"
     bpy.ops.object.shade_smooth()
     bpy.context.object.data.materials.append(principled("Wax", {
