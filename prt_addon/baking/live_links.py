@@ -24,15 +24,19 @@ def bytes_of_links(points: int, links: int) -> int:
     return 16 * points * (links + 1)
 
 
+def linked_points(scene: SceneMesh, target: SceneObject) -> NDArray[np.bool_]:
+    """(p,) which points of a target get links."""
+    material = scene.material[target.points]
+    return np.array([m.is_translucent for m in scene.materials])[material] & ~scene.loose[target.points]
+
+
 def with_subsurface_links(container: BakedTransfer, scene: SceneMesh, target: SceneObject, links: int,
                           threads: int) -> BakedTransfer:
     """The container of a target with so many links per receiver; itself where nothing of it is translucent."""
-    material = scene.material[target.points]
-    translucent = np.array([m.is_translucent for m in scene.materials])[material] & ~scene.loose[target.points]
-    chosen = np.flatnonzero(translucent)
+    chosen = np.flatnonzero(linked_points(scene, target))
     if not len(chosen) or not links:
         return container
-    numbers, body = np.unique(material[chosen], return_inverse=True)
+    numbers, body = np.unique(scene.material[target.points][chosen], return_inverse=True)
     found = _links(scene, target, chosen, numbers, body.reshape(-1), links, threads)
     return replace(container, header={**container.header, ENTRY: links_entry(found)}, links=found)
 
