@@ -47,6 +47,7 @@ from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
+from .distant_lamps import unlit_bakes
 from .live_bodies import body_lines, lamp_light
 from .live_materials import LiveMaterials
 from .properties import assign, session
@@ -490,6 +491,7 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time, moves,
                              {name: shown.owner for name, shown in _live.shown.items()})
     _live.lamps_time = now
+    warnings += [] if bpy.context.scene.prt.lamps_by_directions else unlit_bakes(baked, lamps)
     _note_moves(lamps, now)
     signature = lamps_signature(lamps), frozenset(_live.moving)
     fading = not _live.lamps.settled and any(shown.baked.links is not None for shown in _live.shown.values())
