@@ -107,7 +107,9 @@ class PRT_OT_export(bpy.types.Operator):
             folder = path_of(self.directory)
             check_folder(folder)
             baked = read_all(context.scene, context.scene.name)
-            for _ in export_bakes(baked, folder, relit(context.scene, baked)):
+            shown = context.scene.prt
+            lit = relit(context.scene, baked, window=shown.window, by_directions=shown.lamps_by_directions)
+            for _ in export_bakes(baked, folder, lit):
                 pass
         except PRTError as error:
             self.report({"ERROR"}, str(error))

@@ -13,10 +13,11 @@ import pytest
 from tests.blender import gpu_support  # noqa: F401  makes the checkout the package `prt`
 from tests.blender.cycles import diffuse_material, use_cycles
 from tests.blender.scenes import add_cube, add_mesh, depsgraph
+from tests.blender.test_live_preview import GROUPS
 
 # isort: split
-from prt.operators import export_atlas, light_images
-from prt.operators.export import export_bakes
+from prt.operators import export_atlas, light_images, properties
+from prt.operators.export import PRT_OT_export, export_bakes
 from prt.operators.relit import radiance_arrays, read_all, relit
 from prt.prt_addon.baking.recipe import bake, exhaust
 from prt.prt_addon.baking.settings import make_settings
@@ -129,3 +130,31 @@ def test_images_lie_on_the_users_mesh(room: dict[str, Any], scene: bpy.types.Sce
         light_images.write_image("PRT Floor", np.zeros((4, 4, 3), np.float32))
     bpy.data.objects["Cube"].modifiers.new("Bevel", "BEVEL")
     assert not light_images.write_uv_map(bpy.data.objects["Cube"], baked["Cube"])
+
+
+def test_images_and_exports_show_lamps_from_afar_where_the_panel_does(room: dict[str, Any], scene: bpy.types.Scene,
+                                                                      tmp_path: Path) -> None:
+    classes = (*GROUPS, light_images.PRT_OT_light_images, PRT_OT_export)
+    for one in classes:
+        bpy.utils.register_class(one)
+    properties.register()
+    try:
+        lamp = bpy.data.objects.new("Far", bpy.data.lights.new("Far", "POINT"))
+        lamp.location, lamp.data.energy = (3.0, -6.0, 6.0), 5000.0
+        scene.collection.objects.link(lamp)
+        means = []
+        for shown in (False, True):
+            scene.prt.lamps_by_directions = shown
+            wanted = relit(scene, room, by_directions=shown).radiance("Floor", room["Floor"])
+            assert bpy.ops.prt.light_images() == {"FINISHED"}
+            assert bpy.ops.prt.export(directory=str(tmp_path / "out")) == {"FINISHED"}
+            texels, image = room["Floor"].texels, bpy.data.images["PRT Floor"]
+            pixels = np.array(image.pixels[:], np.float32).reshape(image.size[1], image.size[0], 4)[..., :3]
+            for picture in (pixels, read_image(tmp_path / "out" / "0000_Floor_light.exr")[::-1]):
+                assert np.allclose(picture[texels.row, texels.column], wanted, rtol=1e-4, atol=1e-5)
+            means.append(float(wanted.mean()))
+        assert means[1] > 1.2 * means[0]
+    finally:
+        properties.unregister()
+        for one in reversed(classes):
+            bpy.utils.unregister_class(one)
