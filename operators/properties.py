@@ -163,7 +163,7 @@ class PRTSettings(bpy.types.PropertyGroup):
                     "grow with the square",
     )
     sampling: EnumProperty(
-        name="Shadow Samples", items=SAMPLING_ITEMS, default=PRESETS["standard"].sampling,
+        name="Sampling", items=SAMPLING_ITEMS, default=PRESETS["standard"].sampling,
         description="Of a cubemap's texels, which get rays from which receivers",
     )
     memory_budget: FloatProperty(
