@@ -516,6 +516,7 @@ def _read_far_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None
         direct = _live.lamps.far.direct(name, baked, outside, settings.window, shown.moved)
         if direct is not shown.direct:
             shown.direct = direct
+            _live.materials_dirty = True
             viewport.redraw()
 
 
