@@ -33,7 +33,7 @@ from .render_data import (
     texture_values,
     viewer_of,
 )
-from .scattering import ScatteringPasses, bounced_texture
+from .scattering import ScatteringPasses, bounced_texture, fits
 from .textures import make_texture, read_texture
 
 STALE_DIMMING = 0.3  # factor on a stale object's radiance
@@ -100,6 +100,9 @@ class ObjectDrawing:
         """Take the direct light through the body here, or find out once how long that would take."""
         live, data = scattering.live, self.data
         if not scattering.on_card and live.card_seconds is not None:
+            return
+        if not scattering.on_card and not fits(live):
+            live.card_seconds = np.inf
             return
         if self._passes is None or self._passes.live is not live:
             self._passes = ScatteringPasses(live)
