@@ -42,7 +42,8 @@ class PRT_OT_light_images(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             baked = read_all(context.scene, context.scene.name)
-            lit = relit(context.scene, baked, window=context.scene.prt.window)
+            lit = relit(context.scene, baked, window=context.scene.prt.window,
+                        by_directions=context.scene.prt.lamps_by_directions)
             objects = dict(zip(baked, find_objects(list(baked), context.scene), strict=True))
             at_texels = {name: b for name, b in baked.items() if b.texels is not None}
             unmapped = [name for name, b in at_texels.items() if not write_uv_map(objects[name], b)]
