@@ -71,8 +71,7 @@ class Edited:
 @dataclass
 class _Set:
     """The objects of one bake. surfaces: as they were read last, by name; lit: the light then, and the lamps' direct
-    light, an array that is another one where it differs; glows: (points,) what arrives of a radiance of 1 of an object's
-    slot."""
+    light, an array that is another one where it differs; glows: (points,) what arrives of a radiance of 1 of a slot."""
 
     edits: MaterialEdits
     starts: dict[str, int]
