@@ -121,8 +121,8 @@ def _nodes_of(material: bpy.types.Material | None) -> list[bpy.types.Node]:
 
 
 def shows_relit(scene_object: bpy.types.Object) -> bool:
-    """Whether one of an object's materials shows the light that its bake gave, as an attribute or an image: it stands in
-    for one that was baked."""
+    """Whether one of an object's materials shows the light that its bake gave, as attribute or image: it stands in for
+    one that was baked."""
     return any(RELIT_ATTRIBUTE in (getattr(node, "layer_name", None), getattr(node, "attribute_name", None))
                or HEADER_PROPERTY in (getattr(node, "image", None) or ())
                for material in dict.fromkeys(used_materials(scene_object)) for node in _nodes_of(material))
