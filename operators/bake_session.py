@@ -29,7 +29,7 @@ from ..prt_addon.baking.process import BakeProcess, CompletedBake
 from ..prt_addon.baking.recipe import BakeResult, transport_settings
 from ..prt_addon.baking.record import JobRecord, note_end, read_record, write_record
 from ..prt_addon.baking.settings import BakeSettings
-from ..prt_addon.blender.fingerprint import fingerprint, surroundings
+from ..prt_addon.blender.fingerprint import FOLLOWED, fingerprint, surroundings
 from ..prt_addon.blender.light_region import light_regions
 from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
@@ -198,7 +198,7 @@ class BakeSession:
         """An interrupted bake whose result is there, if the scene is as it was when it was read; else None."""
         found = {o.name_full: o for o in depsgraph.scene.objects}
         if not jobs.job_summary(folder)["complete"] or surroundings(depsgraph) != record.surroundings or any(
-                name not in found or fingerprint(found[name], depsgraph, "live_materials" in digest) != digest
+                name not in found or fingerprint(found[name], depsgraph, FOLLOWED in digest) != digest
                 for name, digest in record.digests.items()):
             return None
         claim = Claim.take(folder)

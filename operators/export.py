@@ -106,8 +106,10 @@ class PRT_OT_export(bpy.types.Operator):
                 raise BadArguments("Export", "no folder is given", "Give directory=")
             folder = path_of(self.directory)
             check_folder(folder)
-            baked = read_all(context.scene, context.scene.name)
-            for _ in export_bakes(baked, folder, relit(context.scene, baked)):
+            scene = context.scene
+            baked = read_all(scene, scene.name)
+            lit = relit(scene, baked, window=scene.prt.window, by_directions=scene.prt.lamps_by_directions)
+            for _ in export_bakes(baked, folder, lit):
                 pass
         except PRTError as error:
             self.report({"ERROR"}, str(error))

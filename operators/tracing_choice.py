@@ -11,6 +11,7 @@ import os
 import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -83,7 +84,8 @@ class TracingProcess(BakeProcess):
         """A child that ended without a word: the next bake goes without the driver."""
         message = super()._death()
         if not self._cancelled:
-            calibration_file().unlink(missing_ok=True)
+            with suppress(OSError):  # of a folder that can't be written: its measurement stays
+                calibration_file().unlink(missing_ok=True)
             message["remedy"] = "Bake again: it resumes, with rays traced by Embree alone"
         return message
 
@@ -155,7 +157,11 @@ class MeasureSession:
         finally:
             self.close()
         path = calibration_file()
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(str(path.parent), f"can't be made ({error.strerror})",
+                               "Make room for it, or let this folder be written") from error
         write_atomically(path, lambda stream: stream.write(text.encode()))
         return f"Rays are traced by {tracing_choice().why}"
 
