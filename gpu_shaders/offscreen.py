@@ -192,11 +192,11 @@ def view_background(
     columns = (np.arange(width) + 0.5) / width * 2.0 - 1.0
     rows = 1.0 - (np.arange(height) + 0.5) / height * 2.0
     # A pixel's points on the near and far planes are affine in its place; far - near is its direction, for
-    # orthographic cameras too.
+    # orthographic cameras too. Homogeneous: with clip planes very far apart the far one's w is rounded to 0, or below.
     picture = np.empty((height, width, 3), np.float32)
     for index, row in enumerate(rows):
         near, far = (_unproject(inverse, columns, row, depth) for depth in (-1.0, 1.0))
-        directions = far - near
+        directions = np.sign(near[:, 3:]) * (far[:, :3] * near[:, 3:] - near[:, :3] * far[:, 3:])
         picture[index] = sample(directions / np.sqrt((directions**2).sum(axis=1, keepdims=True)))
     return picture
 
@@ -227,9 +227,8 @@ def environment_sampler(
 
 
 def _unproject(inverse: NDArray[np.float64], columns: NDArray[np.float64], row: float, depth: float) -> NDArray:
-    """World points (width, 3) of NDC (columns, row, depth)."""
-    points = columns[:, None] * inverse[:, 0] + row * inverse[:, 1] + depth * inverse[:, 2] + inverse[:, 3]
-    return points[:, :3] / points[:, 3:]
+    """Homogeneous world points (width, 4) of NDC (columns, row, depth)."""
+    return columns[:, None] * inverse[:, 0] + row * inverse[:, 1] + depth * inverse[:, 2] + inverse[:, 3]
 
 
 def write_png(path: Path, picture: NDArray[np.floating], scene: bpy.types.Scene) -> None:

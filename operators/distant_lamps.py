@@ -18,11 +18,22 @@ from ..prt_addon.relighting.distant_lamps import AREA_POINTS, distant_lamp_radia
 from ..prt_addon.relighting.lamp_light import lamp_shape
 from ..prt_addon.relighting.moved_light import lamp_in
 from ..prt_addon.relighting.nearest_directions import Hull
+from ..prt_addon.reporting.wording import plural
 from ..prt_addon.storage.container import BakedTransfer
 
 Move = NDArray[np.float64] | None
 INSIDE = ("{}: inside the hull of the scene, where a bake of distant light can't show it. Move it out, or bake with "
           "Lighting: Both")
+UNLIT = ("{}: baked without lamps, which light the rest. Bake all with Lighting: Both, or switch Lamps from Afar on")
+
+
+def unlit_bakes(baked: Mapping[str, BakedTransfer], lamps: Sequence[LocalLight]) -> list[str]:
+    """A warning where lamps light some bakes and not others, which without it would only look dark."""
+    dark = [name for name, b in baked.items() if b.cloud is None]
+    if not lamps or not dark or len(dark) == len(baked):
+        return []
+    others = f" and {plural(len(dark) - 1, 'other', 'others')}" if len(dark) > 1 else ""
+    return [UNLIT.format(f"{dark[0]}{others}")]
 
 
 @dataclass

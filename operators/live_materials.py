@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gpu_shaders.radiosity import measured_solver
+from ..gpu_shaders.render_data import LampScattering
 from ..prt_addon.blender.live_materials import EditedSurfaces, edited_surfaces, read_live, slots_of_receivers
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import baked_mesh
@@ -58,6 +59,7 @@ class Edited:
     key: Hashable
     added: Single
     _joined: tuple[Single | None, Single] | None = None
+    _left: tuple[LampScattering, LampScattering] | None = None
 
     def with_direct(self, direct: Single | None) -> Single:
         """The lamps' direct light and what was added; the same array as long as both are the same."""
@@ -66,6 +68,16 @@ class Edited:
         if self._joined is None or self._joined[0] is not direct:
             self._joined = direct, direct + self.added
         return self._joined[1]
+
+    def with_scattering(self, scattering: LampScattering | None) -> LampScattering | None:
+        """What the graphics card does to `with_direct`: through the body goes the lamps' light alone, as on the
+        processor, so that what was added, a glow for one, is taken off what enters; the same one as long as it is."""
+        if scattering is None or not scattering.on_card:
+            return scattering
+        if self._left is None or self._left[0] is not scattering:
+            entering = -self.added[:, 0] if scattering.bounced is None else scattering.bounced - self.added[:, 0]
+            self._left = scattering, replace(scattering, bounced=entering)
+        return self._left[1]
 
 
 @dataclass

@@ -47,6 +47,7 @@ from ..prt_addon.scene.surface_textures import SurfaceTextures
 from ..prt_addon.storage.columns import Columns
 from ..prt_addon.storage.container import BakedTransfer
 from .display import Display
+from .distant_lamps import unlit_bakes
 from .live_bodies import body_lines, lamp_light
 from .live_materials import LiveMaterials
 from .properties import assign, session
@@ -213,10 +214,11 @@ def draw_list() -> list[DrawItem]:
         moved = transform_since_bake(found, shown.baked.header, _placed(found, shown.local))
         light = _light_on(shown, moved)
         painted, edited = colours.get(name), _live.materials.edited.get(name)
-        key, baked, direct = (shown.key, shown.baked, shown.direct) if edited is None else (
-            edited.key, edited.baked, edited.with_direct(shown.direct))
+        key, baked, direct, scattering = (
+            shown.key, shown.baked, shown.direct, shown.scattering) if edited is None else (
+            edited.key, edited.baked, edited.with_direct(shown.direct), edited.with_scattering(shown.scattering))
         items.append(DrawItem(key, baked, moved, light, 1.0 if painted else exposure, shown.stale,
-                              direct=direct, colours=painted, textures=shown.textures, scattering=shown.scattering))
+                              direct=direct, colours=painted, textures=shown.textures, scattering=scattering))
     if len(owners) < len(_live.owners):  # one was renamed or removed, which Blender may not tell
         _live.bakes_dirty = True
         _schedule(SHORTEST_WAIT)
@@ -489,6 +491,7 @@ def _read_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None:
     lamps = _live.lamps.step(baked, depsgraph, warnings, now - _live.lamps_time, moves,
                              {name: shown.owner for name, shown in _live.shown.items()})
     _live.lamps_time = now
+    warnings += [] if bpy.context.scene.prt.lamps_by_directions else unlit_bakes(baked, lamps)
     _note_moves(lamps, now)
     signature = lamps_signature(lamps), frozenset(_live.moving)
     fading = not _live.lamps.settled and any(shown.baked.links is not None for shown in _live.shown.values())

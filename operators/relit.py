@@ -20,6 +20,7 @@ from ..prt_addon.relighting.exit_radiance import view_radiance
 from ..prt_addon.relighting.moved_light import distant_light_in, moved_normals, moved_points
 from ..prt_addon.relighting.scene_light import joined_light
 from ..prt_addon.storage.container import BakedTransfer
+from .distant_lamps import unlit_bakes
 from .scene_lamps import SceneLamps
 
 
@@ -74,6 +75,7 @@ def relit(scene: bpy.types.Scene, baked: dict[str, BakedTransfer], environment: 
     scene_lamps = SceneLamps() if scene_lamps is None else scene_lamps
     lamps = scene_lamps.step(baked, depsgraph, warnings, moves=moved) if use_scene_lights else []
     outside = scene_lamps.far.step(baked, depsgraph, warnings) if by_directions and use_scene_lights else []
+    warnings += [] if by_directions else unlit_bakes(baked, lamps)
     light, direct = {}, {}
     for name, b in baked.items():
         seen = distant_light_in(distant, b.lighting_basis, moved[name])

@@ -175,7 +175,7 @@ def _shapes(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
 
 
 def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan) -> int:
-    """Bytes in the .blend file: cluster, weights and colour of each receiver, and the bases."""
+    """Bytes in the .blend file: cluster, weights and colour of each receiver, links, and the bases."""
     per_receiver = 4 * (1 + 4 * -(-settings.vectors // 4) + 4)
     if settings.live_editing:
         per_receiver += BYTES_PER_ENTRY * settings.live_entries

@@ -185,11 +185,14 @@ def _part(material: SurfaceMaterial, reflection: Reflection | None, functions: I
     """One material's part. functions: None where its highlight gets no rows."""
     highlight = np.zeros(3) if reflection is None else np.broadcast_to(reflection.albedo(), 3)
     translucent = material.is_translucent and settings.subsurface and is_used
-    if material.is_translucent and is_used and not settings.subsurface:
+    if material.is_translucent and is_used and not settings.subsurface and settings.distant_light:
         left_out.append(LeftOut(f"subsurface light of material {material.name}", "subsurface is false",
                                 "the subsurface stage and three channels"))
     if material.is_translucent and is_used and settings.local_light and not settings.subsurface_links:
         left_out.append(LeftOut(f"light of lamps through material {material.name}", "subsurface_links is 0",
+                                "16 bytes per point and link"))
+    if material.is_translucent and is_used and not settings.local_light and settings.subsurface_links:
+        left_out.append(LeftOut(f"links for lamps through material {material.name}", "lighting is environment alone",
                                 "16 bytes per point and link"))
     through = 1.0 - material.subsurface_weight if translucent else 1.0
     inside = material.subsurface_weight * (1.0 - material.metallic)

@@ -166,6 +166,20 @@ def test_samples_are_averaged_in_scene_linear(scene: Any) -> None:
     assert ((picture[..., 3] > 0) & (picture[..., 3] < 1)).any()  # soft edges
 
 
+@pytest.mark.parametrize(("start", "end"), [(1e-5, 100.0), (1e-6, 1e5)])
+def test_background_does_not_depend_on_the_clip_planes(scene: Any, start: float, end: float) -> None:
+    camera = scene.camera.data
+    camera.type, scene.camera.rotation_euler, scene.camera.location = "PERSP", (1.2, 0.1, 0.4), (0.0, -0.006, 0.001)
+    bpy.context.view_layer.update()
+    wanted = offscreen.camera_background(scene, lambda d: d, 16, 8)
+    before = camera.clip_start, camera.clip_end
+    camera.clip_start, camera.clip_end = start, end
+    bpy.context.view_layer.update()
+    found = offscreen.camera_background(scene, lambda d: d, 16, 8)
+    camera.clip_start, camera.clip_end = before
+    assert np.abs(found - wanted).max() < 1e-4
+
+
 def test_background_is_seen_behind_and_its_directions_are_the_cameras(scene: Any) -> None:
     scene.camera.data.type = "PERSP"
     scene.camera.rotation_euler = (np.pi / 2, 0.0, 0.0)  # looks along +Y, Z up

@@ -12,15 +12,19 @@ import pytest
 
 from tests.blender import gpu_support  # makes the checkout the package `prt`
 from tests.blender.scenes import add_cube, add_mesh, depsgraph
+from tests.blender.test_gpu_scattering import linked_bake
 from tests.blender.test_live_preview import GROUPS, follow, listed
 
 # isort: split
+from prt.gpu_shaders.render_data import LampScattering
 from prt.operators import live_preview, properties
+from prt.operators.live_materials import Edited
 from prt.prt_addon.baking.recipe import bake, exhaust
 from prt.prt_addon.baking.settings import make_settings
 from prt.prt_addon.blender import fingerprint, live_materials, stored
 from prt.prt_addon.blender.read_scene import read_objects
 from prt.prt_addon.relighting.exit_radiance import baked_constants, exit_radiance
+from prt.prt_addon.relighting.live_scattering import LiveScattering
 from prt.prt_addon.scene.scene_mesh import SceneMesh
 
 assert gpu_support
@@ -292,3 +296,21 @@ def test_edits_follow_lamps_by_directions(room) -> None:
     found = live.materials.edited["Wall"].added.copy()
     assert rms(found - before) > 0.1 * rms(before)
     assert np.array_equal(found, follow_materials().materials.edited["Wall"].added)
+
+
+@pytest.mark.parametrize("with_bounces", [False, True])
+def test_an_edit_does_not_enter_a_body_on_the_graphics_card(with_bounces: bool) -> None:
+    """As on the processor, whose sums the card is tested to give (test_gpu_scattering.py): a glow stays whole."""
+    baked, random = linked_bake((0,)), np.random.default_rng(2)
+    live = LiveScattering(baked)
+    direct, added = random.uniform(0.0, 1.0, (2, 700, 2, 3)).astype(np.float32)
+    added[:, 1] = 0.0
+    bounced = random.uniform(0.0, 1.0, (700, 3)).astype(np.float32) if with_bounces else None
+    edited, on_card = Edited(baked, "key", added), LampScattering(live, bounced, on_card=True)
+    asked = edited.with_scattering(on_card)
+    assert edited.with_scattering(on_card) is asked and asked.on_card  # or each redraw would scatter anew
+    found = live.added(edited.with_direct(direct), asked.bounced)
+    assert found == pytest.approx(live.added(direct, bounced) + added, abs=1e-5)
+    assert edited.with_scattering(None) is None
+    timed = LampScattering(live)
+    assert edited.with_scattering(timed) is timed

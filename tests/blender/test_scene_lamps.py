@@ -74,6 +74,19 @@ def test_baked_objects_hidden_in_renders_hide_nothing_and_break_nothing(room: Pa
     assert lamps_of.settled and not lamps_of.outside
 
 
+def test_a_bake_without_lamps_beside_others_is_told(room: Path, tmp_path: Path,
+                                                    capsys: pytest.CaptureFixture[str]) -> None:
+    mixed = tmp_path / "mixed.blend"
+    assert run("bake", "--input", room, "--output", mixed, "--objects", "Back", *FAST) == 0
+    for source, told in ((room, False), (mixed, True)):
+        capsys.readouterr()
+        assert run("relight", "--input", source, "--output", tmp_path / "a.npz", "--use-scene-lights") == 0
+        assert ("Back: baked without lamps, which light the rest" in capsys.readouterr().err) == told
+    for more in ((), ("--use-scene-lights", "--lamps-by-directions")):
+        assert run("relight", "--input", mixed, "--output", tmp_path / "a.npz", *more) == 0
+        assert "baked without lamps" not in capsys.readouterr().err
+
+
 def test_the_panel_tells_of_the_cloud(room: Path) -> None:
     from prt.operators.scene_lamps import cloud_key, cloud_lines
 

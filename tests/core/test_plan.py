@@ -84,6 +84,20 @@ def test_links_of_translucent_bodies_count_where_lamps_are_baked():
         assert with_links.stored_bytes - without.stored_bytes == expected
 
 
+def test_links_count_where_lamps_are_baked_and_are_left_out_else():
+    wax = SurfaceMaterial(name="Wax", subsurface_weight=1.0, subsurface_radius=(0.3, 0.2, 0.1), specular_level=0.0)
+    ball = sphere(radius=0.8, subdivisions=3)
+    ball = replace(ball, materials=(wax,), material_index=np.zeros(len(ball.triangles), np.int32))
+    scene = SceneMesh.assemble([ball])
+    for lighting in ("local", "environment,local", "environment"):
+        none, some = (make_plan(scene, transport_settings(make_settings("draft", {
+            **QUICK, "lighting": lighting, "subsurface_links": links})), None) for links in ("0", "64"))
+        stored = 65 * 16 * none.receivers if "local" in lighting else 0
+        assert some.stored_bytes - none.stored_bytes == stored
+        told = [(item.what, item.why) for item in some.needs.left_out if "Wax" in item.what]
+        assert told == ([] if stored else [("links for lamps through material Wax", "lighting is environment alone")])
+
+
 def test_local_lights_count():
     """As columns in what is stored, as responses on disk, and in memory; merging makes them fewer."""
     scene = still_life("grey")
