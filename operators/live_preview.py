@@ -515,8 +515,7 @@ def _read_far_lamps(depsgraph: bpy.types.Depsgraph, warnings: list[str]) -> None
         shown = _live.shown[name]
         direct = _live.lamps.far.direct(name, baked, outside, settings.window, shown.moved)
         if direct is not shown.direct:
-            shown.direct = direct
-            _live.materials_dirty = True
+            shown.direct, _live.materials_dirty = direct, True
             viewport.redraw()
 
 

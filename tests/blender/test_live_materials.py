@@ -277,3 +277,18 @@ def test_a_glow_is_traced_once_whatever_colours_are_edited(room, monkeypatch: py
     room["Floor"].location.z = 0.0
     follow_materials()
     assert len(traced) > first
+
+
+def test_edits_follow_lamps_by_directions(room) -> None:
+    lamp = bpy.data.objects.new("Far", bpy.data.lights.new("Far", "POINT"))
+    lamp.location, lamp.data.energy = (3.0, -6.0, 6.0), 2000.0
+    bpy.context.scene.collection.objects.link(lamp)
+    bpy.context.scene.prt.lamps_by_directions = True
+    inputs_of(bpy.data.materials["Right"])["Base Color"].default_value = (0.9, 0.1, 0.05, 1.0)
+    before = follow_materials().materials.edited["Wall"].added.copy()
+    lamp.data.energy = 6000.0
+    live = follow()
+    assert live.shown["Wall"].direct is not None
+    found = live.materials.edited["Wall"].added.copy()
+    assert rms(found - before) > 0.1 * rms(before)
+    assert np.array_equal(found, follow_materials().materials.edited["Wall"].added)
