@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gpu_shaders.radiosity import measured_solver
+from ..gpu_shaders.render_data import LampScattering
 from ..prt_addon.blender.live_materials import EditedSurfaces, edited_surfaces, read_live, slots_of_receivers
 from ..prt_addon.blender.read_scene import read_objects
 from ..prt_addon.blender.stored import baked_mesh
@@ -57,15 +58,18 @@ class Edited:
     baked: BakedTransfer
     key: Hashable
     added: Single
-    _joined: tuple[Single | None, Single] | None = None
+    _joined: tuple[Single, LampScattering | None, Single] | None = None
 
-    def with_direct(self, direct: Single | None) -> Single:
-        """The lamps' direct light and what was added; the same array as long as both are the same."""
+    def with_direct(self, direct: Single | None, scattering: LampScattering | None = None) -> Single:
+        """The lamps' direct light and what was added; the same array as long as both are the same. scattering: what is
+        left to be done to that light alone; it is done here, as what was added knows of the body already."""
         if direct is None:
             return self.added
-        if self._joined is None or self._joined[0] is not direct:
-            self._joined = direct, direct + self.added
-        return self._joined[1]
+        if self._joined is None or self._joined[0] is not direct or self._joined[1] is not scattering:
+            through = scattering is not None and scattering.on_card
+            lit = scattering.live.added(direct, scattering.bounced) if through else direct
+            self._joined = direct, scattering, lit + self.added
+        return self._joined[2]
 
 
 @dataclass

@@ -213,10 +213,10 @@ def draw_list() -> list[DrawItem]:
         moved = transform_since_bake(found, shown.baked.header, _placed(found, shown.local))
         light = _light_on(shown, moved)
         painted, edited = colours.get(name), _live.materials.edited.get(name)
-        key, baked, direct = (shown.key, shown.baked, shown.direct) if edited is None else (
-            edited.key, edited.baked, edited.with_direct(shown.direct))
+        key, baked, direct, scattering = (shown.key, shown.baked, shown.direct, shown.scattering) if edited is None \
+            else (edited.key, edited.baked, edited.with_direct(shown.direct, shown.scattering), None)
         items.append(DrawItem(key, baked, moved, light, 1.0 if painted else exposure, shown.stale,
-                              direct=direct, colours=painted, textures=shown.textures, scattering=shown.scattering))
+                              direct=direct, colours=painted, textures=shown.textures, scattering=scattering))
     if len(owners) < len(_live.owners):  # one was renamed or removed, which Blender may not tell
         _live.bakes_dirty = True
         _schedule(SHORTEST_WAIT)

@@ -102,3 +102,20 @@ def test_links_that_fit_no_texture_stay_with_the_processor(monkeypatch: pytest.M
     wanted = live.added(np.ones((700, 2, 3), np.float32), None)
     drawing.add_direct(wanted, LampScattering(live))
     assert live.card_seconds == np.inf and not live.prefers_card
+
+
+def test_what_edits_of_materials_add_does_not_go_through_the_body_again() -> None:
+    from prt.gpu_shaders.render_data import LampScattering
+    from prt.operators.live_materials import Edited
+    from prt.prt_addon.relighting.live_scattering import LiveScattering
+
+    baked, random = linked_bake((0,)), np.random.default_rng(2)
+    direct, added = random.uniform(0.0, 1.0, (2, 700, 2, 3)).astype(np.float32)
+    bounced = random.uniform(0.0, 1.0, (700, 3)).astype(np.float32)
+    live, edited = LiveScattering(baked), Edited(baked, "key", added)
+    on_card = LampScattering(live, bounced, on_card=True)
+    found = edited.with_direct(direct, on_card)
+    assert found == pytest.approx(live.added(direct, bounced) + added, abs=1e-6)
+    assert edited.with_direct(direct, on_card) is found
+    assert np.array_equal(edited.with_direct(direct, LampScattering(live)), direct + added)
+    assert edited.with_direct(None, None) is added
