@@ -20,6 +20,7 @@ from ..prt_addon.relighting.exit_radiance import baked_constants
 from ..prt_addon.relighting.live_scattering import LiveScattering
 from ..prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
 from . import image_textures, programs, texel_programs
+from .compute_program import GROUP_SIZE
 from .image_textures import TexturedVertices, textured_vertices
 from .render_data import (
     DrawItem,
@@ -77,7 +78,7 @@ class ObjectDrawing:
         program.uniform_int("rows", data.rows)
         program.uniform_int("vectors", data.vectors)
         width, height = data.exit_size
-        gpu.compute.dispatch(program, width // programs.GROUP_SIZE, height, 1)
+        gpu.compute.dispatch(program, width // GROUP_SIZE, height, 1)
 
     def show_colours(self, colours: NDArray[np.float32]) -> None:
         """Draw (points, 3) colours in place of computed radiances."""

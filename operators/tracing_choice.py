@@ -24,6 +24,7 @@ from ..prt_addon.blender.ground_truth import blender_command
 from ..prt_addon.errors import StorageError
 from ..prt_addon.storage.files import write_atomically
 from ..prt_addon.tracing.ray_cost import Calibration, TracerChoice, choose_tracer
+from .side_job import SideJob
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 WORKER = Path(__file__).resolve().parents[1] / "gpu_shaders" / "tracing_worker.py"
@@ -141,12 +142,11 @@ class MeasureRequest:
 
 
 @dataclass
-class MeasureSession:
+class MeasureSession(SideJob):
     """A measurement under way: poll `process` until it is finished, then `conclude`."""
 
     process: MeasureProcess
     notes: tuple[str, ...] = ()
-    writes_bakes: ClassVar[bool] = False
 
     def conclude(self) -> str:
         """Keep the result; what to tell the user. Raises StorageError."""
@@ -164,17 +164,3 @@ class MeasureSession:
                                "Make room for it, or let this folder be written") from error
         write_atomically(path, lambda stream: stream.write(text.encode()))
         return f"Rays are traced by {tracing_choice().why}"
-
-    def object_in_use(self) -> None:
-        """No object is touched."""
-
-    def end(self, _state: str) -> None:
-        """It was cancelled or failed."""
-        self.close()
-
-    def close(self) -> None:
-        """End the child if it lives. May be called twice."""
-        self.process.cancel()
-
-    def file_saved(self) -> None:
-        """It knows no file."""

@@ -121,7 +121,6 @@ def choose_basis(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight
     return chosen.settings, BasisChoice(line, {"line": line, **facts})
 
 
-
 def basis_advice(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None, threads: int | None = None,
                  ) -> str:
     """What an automatic choice would take where the one made by hand loses more of the present light than is asked; ""

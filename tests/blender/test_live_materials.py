@@ -197,19 +197,6 @@ def test_edits_follow_the_light(room) -> None:
         assert rms(after[name] - 2.0 * before[name]) < 2e-3 * rms(after[name])
 
 
-def test_edits_follow_lamps_from_afar(room) -> None:
-    bpy.context.scene.prt.lamps_by_directions = True
-    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT"))
-    lamp.data.energy, lamp.location = 5000.0, (0.0, -1.0, 8.0)
-    bpy.context.scene.collection.objects.link(lamp)
-    inputs_of(bpy.data.materials["Right"])["Base Color"].default_value = (0.9, 0.1, 0.05, 1.0)
-    live = follow_materials()
-    before = live.materials.edited["Wall"].added.copy()
-    lamp.data.energy *= 3.0
-    live = follow()  # nothing but a lamp's update was noted
-    assert np.abs(live.materials.edited["Wall"].added).max() > 1.5 * np.abs(before).max() > 0.0
-
-
 def test_form_factors_survive_a_file_and_go_with_the_bake(room, tmp_path: Path) -> None:
     floor = room["Floor"]
     kept = live_materials.read_live(stored.baked_mesh(floor), "Floor")
