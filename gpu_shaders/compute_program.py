@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import gpu
 
+GROUP_SIZE = 64  # invocations of a work group; divides render_data.TEXTURE_WIDTH
 # Types of push constants as Blender names them, and in GLSL.
 GLSL_TYPES = {"INT": "int", "FLOAT": "float", "VEC2": "vec2", "VEC3": "vec3", "VEC4": "vec4", "IVEC2": "ivec2",
               "IVEC3": "ivec3", "IVEC4": "ivec4", "MAT4": "mat4"}
@@ -39,7 +40,7 @@ class ComputeProgram:
     images: tuple[tuple[str, str], ...]
     constants: tuple[tuple[str, str], ...]
     defines: tuple[tuple[str, str], ...] = ()
-    group: tuple[int, int, int] = (64, 1, 1)
+    group: tuple[int, int, int] = (GROUP_SIZE, 1, 1)
 
     def shader(self) -> gpu.types.GPUShader:
         """Compiled by Blender, once; `release` frees it."""

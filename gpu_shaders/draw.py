@@ -15,9 +15,12 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
+from ..prt_addon.errors import PRTError
 from ..prt_addon.relighting.exit_radiance import baked_constants
+from ..prt_addon.relighting.live_scattering import LiveScattering
 from ..prt_addon.scene.surface_textures import SurfaceTextures, TextureUse
 from . import image_textures, programs, texel_programs
+from .compute_program import GROUP_SIZE
 from .image_textures import TexturedVertices, textured_vertices
 from .render_data import (
     DrawItem,
@@ -33,7 +36,7 @@ from .render_data import (
     texture_values,
     viewer_of,
 )
-from .scattering import ScatteringPasses, bounced_texture
+from .scattering import ScatteringPasses, bounced_texture, fits
 from .textures import make_texture, read_texture
 
 STALE_DIMMING = 0.3  # factor on a stale object's radiance
@@ -75,7 +78,7 @@ class ObjectDrawing:
         program.uniform_int("rows", data.rows)
         program.uniform_int("vectors", data.vectors)
         width, height = data.exit_size
-        gpu.compute.dispatch(program, width // programs.GROUP_SIZE, height, 1)
+        gpu.compute.dispatch(program, width // GROUP_SIZE, height, 1)
 
     def show_colours(self, colours: NDArray[np.float32]) -> None:
         """Draw (points, 3) colours in place of computed radiances."""
@@ -99,17 +102,25 @@ class ObjectDrawing:
     def _scatter(self, scattering: LampScattering) -> None:
         """Take the direct light through the body here, or find out once how long that would take."""
         live, data = scattering.live, self.data
-        if not scattering.on_card and live.card_seconds is not None:
-            return
-        if self._passes is None or self._passes.live is not live:
-            self._passes = ScatteringPasses(live)
         if scattering.on_card:
+            if self._passes is None or self._passes.live is not live:
+                self._passes = ScatteringPasses(live)
             bounced = None if scattering.bounced is None else bounced_texture(scattering.bounced)
             self._direct = self._passes.run(self._direct, bounced, data.points, data.rows)
-        else:
-            live.card_seconds = self._passes.seconds(data.points, data.rows)
-            if live.card_seconds >= live.seconds:
+        elif live.card_seconds is None:
+            live.card_seconds = self._card_seconds(live)
+            if not live.prefers_card:
                 self._passes = None  # the processor will go on
+
+    def _card_seconds(self, live: LiveScattering) -> float:
+        """How long the passes take here; infinite where the links fit no texture or the driver can't run them."""
+        if not fits(live):
+            return float("inf")
+        try:
+            self._passes = ScatteringPasses(live)
+            return self._passes.seconds(self.data.points, self.data.rows)
+        except (PRTError, RuntimeError, SystemError, ValueError):  # the processor always can
+            return float("inf")
 
     def show_textures(self, textures: SurfaceTextures | None) -> None:
         """Take the albedo from images from now on; None for that of the points."""

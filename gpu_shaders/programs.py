@@ -18,14 +18,13 @@ from . import compute_program, hemisphere_glsl
 from .compute_program import ComputeProgram, source
 from .render_data import TEXTURE_WIDTH
 
-GROUP_SIZE = 64  # invocations of a work group; divides TEXTURE_WIDTH
 RELEASED_TOO: list[Callable[[], None]] = []  # what frees the programs of modules that build on this one
 
 
 EXIT_RADIANCE = ComputeProgram(
     ("texel_layout.glsl", "exit_radiance.comp.glsl"), ("encoding_values", "constant_values"),
     (("exit_values", "WRITE"),), (("INT", "points"), ("INT", "rows"), ("INT", "vectors")),
-    (("TEXTURE_WIDTH", str(TEXTURE_WIDTH)),), (GROUP_SIZE, 1, 1))
+    (("TEXTURE_WIDTH", str(TEXTURE_WIDTH)),))
 
 
 def exit_radiance() -> gpu.types.GPUShader:

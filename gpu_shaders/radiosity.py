@@ -19,8 +19,8 @@ from ..prt_addon.relighting.material_edits import TOLERANCE
 from ..prt_addon.transport.form_factors import check_exits
 from ..prt_addon.transport.radiosity import JACOBI, MOST_ITERATIONS, Radiosity
 from . import radiosity_texels
+from .compute_program import GROUP_SIZE
 from .draw import make_texture, read_texture
-from .radiosity_texels import GROUP_SIZE
 from .render_data import texture_values
 
 # Iterations between two looks at the residual: reading a texture back waits for the GPU.
@@ -98,7 +98,7 @@ def measured_solver(matrix: sparse.csr_matrix) -> tuple[Callable[..., Radiosity]
     sparse_multiply_few(matrix, values)
     began = time.perf_counter()
     sparse_multiply_few(matrix, values)
-    product = time.perf_counter() - began
+    product = max(time.perf_counter() - began, 1e-9)
     try:
         solver = RadiosityOnGpu(matrix)
         solver.seconds(1)  # compiles

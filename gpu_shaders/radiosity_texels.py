@@ -12,12 +12,10 @@ from scipy import sparse
 from .compute_program import ComputeProgram
 from .render_data import TEXTURE_WIDTH, texture_values
 
-GROUP_SIZE = 64  # invocations of a work group; divides TEXTURE_WIDTH
-
 JACOBI = ComputeProgram(
     ("texel_layout.glsl", "radiosity_jacobi.comp.glsl"),
     ("entry_values", "row_values", "albedo_values", "emittance_values", "radiosity_values"),
-    (("next_values", "WRITE"),), (("INT", "receivers"),), (("TEXTURE_WIDTH", str(TEXTURE_WIDTH)),), (GROUP_SIZE, 1, 1))
+    (("next_values", "WRITE"),), (("INT", "receivers"),), (("TEXTURE_WIDTH", str(TEXTURE_WIDTH)),))
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.relighting.live_scattering import LiveScattering
-from .compute_program import ComputeProgram
+from .compute_program import GROUP_SIZE, ComputeProgram
 from .render_data import LARGEST_TEXTURE, TEXTURE_WIDTH, texture_height, texture_values
-from .subsurface_programs import GROUP_SIZE, NODE_TEXELS, program
+from .subsurface_programs import NODE_TEXELS, program
 from .textures import make_texture, read_texture
 
 Texture = gpu.types.GPUTexture

@@ -11,7 +11,6 @@ from ..prt_addon.relighting.subsurface_texels import FACTOR_SCALE, LEAST_SHIFT
 from .compute_program import ComputeProgram
 from .render_data import TEXTURE_WIDTH
 
-GROUP_SIZE = 64
 NODE_TEXELS = 4
 _SAMPLERS = {
     "irradiance": ("place_values", "direct_values", "bounced_values"), "lamp": ("geometry_values",),
@@ -40,4 +39,4 @@ def program(name: str, moments: bool = True) -> ComputeProgram:
         defines.append(("MOMENTS", "1"))
     samplers = () if name == "reduce" and not moments else _SAMPLERS[name]
     return ComputeProgram(("texel_layout.glsl", f"subsurface_{name}.comp.glsl"), samplers, (_IMAGES[name],),
-                          _CONSTANTS[name], tuple(defines), (GROUP_SIZE, 1, 1))
+                          _CONSTANTS[name], tuple(defines))

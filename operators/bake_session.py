@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..prt_addon.baking import job as jobs
-from ..prt_addon.baking.basis_choice import choose_basis
+from ..prt_addon.baking.basis_choice import basis_advice, choose_basis
 from ..prt_addon.baking.claims import Claim, discard_if_free
 from ..prt_addon.baking.distant_basis import distant_basis
 from ..prt_addon.baking.local_lights import fit_to_lamps
@@ -29,7 +29,7 @@ from ..prt_addon.baking.process import BakeProcess, CompletedBake
 from ..prt_addon.baking.recipe import BakeResult, transport_settings
 from ..prt_addon.baking.record import JobRecord, note_end, read_record, write_record
 from ..prt_addon.baking.settings import BakeSettings
-from ..prt_addon.blender.fingerprint import fingerprint, surroundings
+from ..prt_addon.blender.fingerprint import FOLLOWED, fingerprint, surroundings
 from ..prt_addon.blender.light_region import light_regions
 from ..prt_addon.blender.lights import reference_light
 from ..prt_addon.blender.local_lights import read_local_lights
@@ -96,6 +96,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
     settings, lost = fit_to_lamps(settings, read_local_lights(depsgraph, []))
     light = reference_light(depsgraph)
     # In Blender's own process nothing starts threads (design/architecture.md).
+    advice = basis_advice(scene, settings, light, threads=1)
     settings, choice = choose_basis(scene, settings, light, threads=1)
     settings = transport_settings(settings)
     plan = make_plan(scene, settings, light)
@@ -115,7 +116,7 @@ def analyze_scene(depsgraph: bpy.types.Depsgraph, settings: BakeSettings,
         "choice": None if choice is None else choice.facts,
         "left_out": [*(asdict(item) for item in plan.needs.left_out), *left_out(settings.threads)],
         "tracer": tracing_choice(settings.threads).why,
-        "hints": list(plan.needs.hints),
+        "hints": [*([advice] if advice else []), *plan.needs.hints],
         "warnings": [*([f"Bake: {too_much}"] if too_much else []), *scene.warnings, *lost],
         "seconds": sum(plan.seconds.values()),
         "stages": plan.seconds,
@@ -197,7 +198,7 @@ class BakeSession:
         """An interrupted bake whose result is there, if the scene is as it was when it was read; else None."""
         found = {o.name_full: o for o in depsgraph.scene.objects}
         if not jobs.job_summary(folder)["complete"] or surroundings(depsgraph) != record.surroundings or any(
-                name not in found or fingerprint(found[name], depsgraph, "live_materials" in digest) != digest
+                name not in found or fingerprint(found[name], depsgraph, FOLLOWED in digest) != digest
                 for name, digest in record.digests.items()):
             return None
         claim = Claim.take(folder)

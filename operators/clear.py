@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..prt_addon.blender.light_images import drop_light_images
 from ..prt_addon.blender.own_colours import drop_own_colours
 from ..prt_addon.blender.stored import baked_objects, clear_baked, clear_orphans
 from ..prt_addon.blender.stored_report import clear_report
@@ -45,6 +46,7 @@ class PRT_OT_clear(bpy.types.Operator):
             chosen = [o for o in baked if (o in named if named else o.select_get())] or ([] if named else baked)
             for baked_object in chosen:
                 drop_own_colours(baked_object)
+                drop_light_images(baked_object)
                 clear_baked(baked_object)
             if len(chosen) == len(baked):
                 clear_report(context.scene)

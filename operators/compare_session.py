@@ -29,6 +29,7 @@ from ..prt_addon.storage.files import save_json
 from .place import Place
 from .properties import assign, session
 from .relit import draw_lit, read_all, relit
+from .side_job import SideJob
 
 DRAWN_SAMPLES = 4  # of the preview, per pixel and axis: edges within objects as smooth as those of the render
 MANY_PIXELS = 10 ** 6  # from which on edges are fine enough, and such a picture takes too much memory
@@ -80,7 +81,7 @@ class CompareRequest:
 
 
 @dataclass
-class CompareSession:
+class CompareSession(SideJob):
     """A comparison under way: poll `process` until it is finished, then `finish` or `conclude` it. drawn: (h, w, 4),
     scene-linear; remarks: what is not compared like with like; picture, report: files to write, or None."""
 
@@ -94,7 +95,6 @@ class CompareSession:
     picture: Path | None = None
     report: Path | None = None
     notes: tuple[str, ...] = ()  # nothing of what the artist did meanwhile counts
-    writes_bakes: ClassVar[bool] = False
 
     @staticmethod
     def start(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> CompareSession:
@@ -125,20 +125,6 @@ class CompareSession:
         where = [] if shown else [f"The picture is the image \"{IMAGE}\": open an Image Editor to see it"]
         assign(session(), comparison="\n".join([*compared.lines, *where]))
         return f"Compared with Cycles: {compared.lines[0][0].lower()}{compared.lines[0][1:]}"
-
-    def object_in_use(self) -> None:
-        """Nothing that could be in edit mode is written."""
-
-    def end(self, _state: str) -> None:
-        """It was cancelled or failed."""
-        self.close()
-
-    def close(self) -> None:
-        """End the child if it lives. May be called twice."""
-        self.process.cancel()
-
-    def file_saved(self) -> None:
-        """The copy that is rendered has a name of its own."""
 
     def finish(self) -> Compared:
         """Read what Cycles left, and compare. Call it after the "done" message. Raises StorageError."""

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import bpy
 import numpy as np
@@ -42,7 +41,7 @@ class DistantLamps:
     """What depends on geometry is kept until `forget_geometry`, a lamp's light while it stays as it is."""
 
     _hull: Hull | None = None
-    _kept: dict[str, tuple[Any, NDArray[np.float32]]] = field(default_factory=dict)
+    _kept: dict[str, tuple[BakedTransfer, Hashable, NDArray[np.float32]]] = field(default_factory=dict)
 
     def forget_geometry(self) -> None:
         """Something moved or changed its shape."""
@@ -78,7 +77,8 @@ class DistantLamps:
         if baked.cloud is not None or not lamps:
             return None
         seen = lamps if moved is None else [lamp_in(lamp, moved) for lamp in lamps]
-        key = (id(baked), window, tuple((lamp_shape(lamp), lamp.power.tobytes()) for lamp in seen))
-        if name not in self._kept or self._kept[name][0] != key:
-            self._kept[name] = key, distant_lamp_radiance(baked, seen, window)
-        return self._kept[name][1]
+        key = window, tuple((lamp_shape(lamp), lamp.power.tobytes()) for lamp in seen)
+        held = self._kept.get(name)
+        if held is None or held[0] is not baked or held[1] != key:
+            held = self._kept[name] = baked, key, distant_lamp_radiance(baked, seen, window)
+        return held[2]

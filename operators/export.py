@@ -106,9 +106,9 @@ class PRT_OT_export(bpy.types.Operator):
                 raise BadArguments("Export", "no folder is given", "Give directory=")
             folder = path_of(self.directory)
             check_folder(folder)
-            baked = read_all(context.scene, context.scene.name)
-            shown = context.scene.prt
-            lit = relit(context.scene, baked, window=shown.window, by_directions=shown.lamps_by_directions)
+            scene = context.scene
+            baked = read_all(scene, scene.name)
+            lit = relit(scene, baked, window=scene.prt.window, by_directions=scene.prt.lamps_by_directions)
             for _ in export_bakes(baked, folder, lit):
                 pass
         except PRTError as error:

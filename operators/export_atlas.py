@@ -61,11 +61,16 @@ def _write_obj(path: Path, baked: BakedTransfer) -> Path:
     """The surface as a Wavefront file: each corner has a UV of its own."""
     surface = baked.texels
     places = (surface.places.reshape(-1, 2) + 0.5) / np.array([surface.width, surface.height])
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in surface.points.tolist()]
-    lines += [f"vt {u:.7f} {v:.7f}" for u, v in places.tolist()]
-    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in surface.normals.tolist()]
-    lines += ["f " + " ".join(f"{corner + 1}/{3 * number + k + 1}/{corner + 1}" for k, corner in enumerate(triangle))
-              for number, triangle in enumerate(surface.triangles.tolist())]
-    content = ("\n".join(["# written by PRT", *lines]) + "\n").encode()
+    corner, places_of = surface.triangles + 1, np.arange(3 * len(surface.triangles)).reshape(-1, 3) + 1
+    faces = np.stack([corner, places_of, corner], axis=2).reshape(-1, 9)
+    text = "# written by PRT\n" + "".join(_rows(template, values) for template, values in (
+        ("v %.9g %.9g %.9g\n", surface.points), ("vt %.7f %.7f\n", places), ("vn %.6f %.6f %.6f\n", surface.normals),
+        ("f %d/%d/%d %d/%d/%d %d/%d/%d\n", faces)))
+    content = text.encode()
     write_atomically(path, lambda stream: stream.write(content) and None)
     return path
+
+
+def _rows(template: str, values: NDArray[np.generic]) -> str:
+    """A line for each row of values (n, k), all in one go."""
+    return template * len(values) % tuple(values.ravel().tolist())

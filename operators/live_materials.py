@@ -82,15 +82,15 @@ class Edited:
 
 @dataclass
 class _Set:
-    """The objects of one bake. surfaces: as they were read last, by name; lit: the light then;
-    glows: (points,) what arrives of a radiance of 1 of an object's slot."""
+    """The objects of one bake. surfaces: as they were read last, by name; lit: the light then, and the lamps' direct
+    light, an array that is another one where it differs; glows: (points,) what arrives of a radiance of 1 of a slot."""
 
     edits: MaterialEdits
     starts: dict[str, int]
     slots: dict[str, NDArray[np.int32] | None] = field(default_factory=dict)
     glows: dict[tuple[str, int], Single] = field(default_factory=dict)
     surfaces: dict[str, EditedSurfaces] = field(default_factory=dict)
-    lit: dict[str, Hashable] = field(default_factory=dict)
+    lit: dict[str, tuple[bytes, Single | None]] = field(default_factory=dict)
     versions: int = 0
 
 
@@ -162,8 +162,8 @@ class LiveMaterials:
             edited = any(one.changed for one in surfaces.values())
             same = set(surfaces) == set(found.surfaces) and all(
                 _same(one, found.surfaces[name]) for name, one in surfaces.items())
-            lit = {name: (lights[name].tobytes(), id(shown[name].direct)) for name in found.starts if name in lights}
-            if same and (lit == found.lit or not edited):
+            lit = {name: (lights[name].tobytes(), shown[name].direct) for name in found.starts if name in lights}
+            if same and (_same_light(lit, found.lit) or not edited):
                 continue
             found.lit = lit
             try:
@@ -296,6 +296,12 @@ def _same(one: EditedSurfaces, other: EditedSurfaces) -> bool:
     """Whether nothing that counts differs."""
     return one.changed == other.changed and float(np.abs(one.albedo - other.albedo).max(initial=0.0)) < SAME \
         and float(np.abs(one.emission - other.emission).max(initial=0.0)) < SAME
+
+
+def _same_light(one: dict[str, tuple[bytes, Single | None]], other: dict[str, tuple[bytes, Single | None]]) -> bool:
+    """Whether the light on all objects is the same."""
+    return one.keys() == other.keys() and all(
+        light == other[name][0] and direct is other[name][1] for name, (light, direct) in one.items())
 
 
 def _diffuse_row(item: Shown, light: Single) -> Single:

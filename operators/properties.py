@@ -73,9 +73,9 @@ DISTANT_BASIS_ITEMS = (
 SAMPLING_ITEMS = (
     ("automatic", "Automatic", "All texels, unless fewer are surely faster and exact enough. The report says why", 0),
     ("every", "Every Element", "Rays for all texels at all receivers. No error, and mostly the fastest", 1),
-    ("sparse", "Sparse", "Rays for about an eighth of them; the rest is woven from neighbours. At best nearly twice as "
-                         "fast, on detailed meshes; slower on simple ones. Adds about 1 % of error; the report states "
-                         "it", 2),
+    ("sparse", "Sparse", "Rays for about an eighth of them; the rest is woven from neighbours. Shadows take about as "
+                         "long, compression less than half, as it starts from fewer points. Adds up to about 1 % of "
+                         "error; the report states it", 2),
 )
 RECEIVERS_ITEMS = (
     ("vertices", "Vertices", "Light is kept at the mesh's vertices, and between them on faces longer than Longest "

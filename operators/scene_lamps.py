@@ -74,6 +74,7 @@ class SceneLamps:
         are others (collection instances). Lamps that are outside a cloud are named in warnings.
         """
         near = {name: b for name, b in baked.items() if b.cloud is not None}
+        self._scattering = {name: held for name, held in self._scattering.items() if near.get(name) is held[0]}
         if not near:
             self._lit = {}
             return []

@@ -11,6 +11,7 @@ import os
 import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -23,6 +24,7 @@ from ..prt_addon.blender.ground_truth import blender_command
 from ..prt_addon.errors import StorageError
 from ..prt_addon.storage.files import write_atomically
 from ..prt_addon.tracing.ray_cost import Calibration, TracerChoice, choose_tracer
+from .side_job import SideJob
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 WORKER = Path(__file__).resolve().parents[1] / "gpu_shaders" / "tracing_worker.py"
@@ -83,7 +85,8 @@ class TracingProcess(BakeProcess):
         """A child that ended without a word: the next bake goes without the driver."""
         message = super()._death()
         if not self._cancelled:
-            calibration_file().unlink(missing_ok=True)
+            with suppress(OSError):  # of a folder that can't be written: its measurement stays
+                calibration_file().unlink(missing_ok=True)
             message["remedy"] = "Bake again: it resumes, with rays traced by Embree alone"
         return message
 
@@ -139,12 +142,11 @@ class MeasureRequest:
 
 
 @dataclass
-class MeasureSession:
+class MeasureSession(SideJob):
     """A measurement under way: poll `process` until it is finished, then `conclude`."""
 
     process: MeasureProcess
     notes: tuple[str, ...] = ()
-    writes_bakes: ClassVar[bool] = False
 
     def conclude(self) -> str:
         """Keep the result; what to tell the user. Raises StorageError."""
@@ -155,20 +157,10 @@ class MeasureSession:
         finally:
             self.close()
         path = calibration_file()
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(str(path.parent), f"can't be made ({error.strerror})",
+                               "Make room for it, or let this folder be written") from error
         write_atomically(path, lambda stream: stream.write(text.encode()))
         return f"Rays are traced by {tracing_choice().why}"
-
-    def object_in_use(self) -> None:
-        """No object is touched."""
-
-    def end(self, _state: str) -> None:
-        """It was cancelled or failed."""
-        self.close()
-
-    def close(self) -> None:
-        """End the child if it lives. May be called twice."""
-        self.process.cancel()
-
-    def file_saved(self) -> None:
-        """It knows no file."""

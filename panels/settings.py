@@ -112,6 +112,8 @@ class PRT_PT_compression(_Expert, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         settings, column = context.scene.prt, self.column(context)
         column.prop(settings, "encoder")
+        if settings.encoder == "auto" and settings.distant_basis == "cubemap":
+            column.prop(settings, "light_error")  # what it chooses by; the other panel shows the cubemap's size
         column.prop(settings, "clusters")
         column.prop(settings, "vectors")
         column.prop(settings, "compression_error")

@@ -77,7 +77,7 @@ class Candidate:
         """For JSON."""
         settings = self.settings
         size = {"order": settings.order} if settings.distant_basis == "sh" else {"cubemap_size": settings.cubemap_size}
-        return {"distant_basis": settings.distant_basis, **size, "encoder": settings.encoder,
+        return {"name": self.name, "distant_basis": settings.distant_basis, **size, "encoder": settings.encoder,
                 "vectors": settings.vectors, "predicted_error": self.error, "basis_error": self.basis_error,
                 "encoder_error": self.encoder_error, "stored_bytes": self.stored_bytes, "seconds": self.seconds}
 
@@ -119,6 +119,22 @@ def choose_basis(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight
              "probe": {"receivers": probe.receivers, "rays": probe.rays, "seconds": time.perf_counter() - started}}
     line = _line(chosen, found, settings.light_error)
     return chosen.settings, BasisChoice(line, {"line": line, **facts})
+
+
+def basis_advice(scene: SceneMesh, settings: BakeSettings, light: ReferenceLight | None, threads: int | None = None,
+                 ) -> str:
+    """What an automatic choice would take where the one made by hand loses more of the present light than is asked; ""
+    where it does not, or where there is nothing to say. Arguments as for `choose_basis`."""
+    by_hand = not (AUTO in (settings.distant_basis, settings.encoder) or settings.fit_order_to_light)
+    if not (by_hand and settings.distant_light) or light is None or light.is_black:
+        return ""
+    chosen, choice = choose_basis(scene, replace(settings, distant_basis=AUTO), light, threads)
+    own, other = Candidate(settings, 0.0, 0.0), Candidate(chosen, 0.0, 0.0)
+    lost = {entry["name"]: entry["predicted_error"] for entry in choice.facts["candidates"]} if choice else {}
+    if own.name == other.name or lost.get(own.name, 0.0) <= settings.light_error:
+        return ""
+    return f"about {percent(lost[own.name])} of this light's shadows lost with {own.name}; Sky By: Automatic would " \
+           f"take {other.name}, with {percent(lost[other.name])}"
 
 
 def _clusters(settings: BakeSettings) -> str:

@@ -25,7 +25,7 @@ from ..basis.spherical_harmonics import evaluate
 from ..lighting.analytic import sun
 from ..lighting.bright_light import is_sharp
 from ..lighting.cubemap_light import shared, sun_texels
-from ..lighting.environment import direction_of_pixel
+from ..lighting.environment import direction_of_pixel, pixel_solid_angles
 from ..lighting.reference_light import ReferenceLight
 from ..linear_algebra import multiply
 from ..scene.scene_mesh import SceneMesh
@@ -97,8 +97,7 @@ def _parts(light: ReferenceLight) -> _Light:
     """The light's even part and its small sources."""
     light = light.coarse()
     height, width = light.image.shape[:2]
-    edges = np.cos(np.arange(height + 1) * np.pi / height)
-    solid_angle = np.repeat((edges[:-1] - edges[1:]) * (2.0 * np.pi / width), width)
+    solid_angle = np.repeat(pixel_solid_angles(height, width), width)
     image = light.image.reshape(-1, 3).astype(np.float64)
     brightest = np.argsort(-image.sum(axis=1) * solid_angle, kind="stable")[:BRIGHTEST]
     flux = image[brightest] * solid_angle[brightest, None] / SAMPLES ** 2

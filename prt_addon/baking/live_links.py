@@ -16,24 +16,28 @@ from ..storage.subsurface_links import ENTRY, links_entry
 from ..transport.dipole import Medium
 from ..transport.subsurface_links import adaptive_links
 from ..transport.surface_pyramid import SurfacePyramid
+from .settings import BakeSettings
 from .translucency import point_areas
 
 
-def bytes_of_links(points: int, links: int) -> int:
-    """What they take, and what a preview's graphics card takes again."""
-    return 16 * points * (links + 1)
+def links_bytes(scene: SceneMesh, settings: BakeSettings) -> int:
+    """What the links of a bake take in the file, and what a preview's graphics card takes again."""
+    if not settings.local_light or not settings.subsurface_links:
+        return 0
+    points = sum(len(translucent_points(scene, target)) for target in scene.objects if target.is_target)
+    return 16 * points * (settings.subsurface_links + 1)
 
 
-def linked_points(scene: SceneMesh, target: SceneObject) -> NDArray[np.bool_]:
-    """(p,) which points of a target get links."""
-    material = scene.material[target.points]
-    return np.array([m.is_translucent for m in scene.materials])[material] & ~scene.loose[target.points]
+def translucent_points(scene: SceneMesh, target: SceneObject) -> NDArray[np.int64]:
+    """The points of a target, counted from its first, whose material is translucent."""
+    translucent = np.array([m.is_translucent for m in scene.materials])[scene.material[target.points]]
+    return np.flatnonzero(translucent & ~scene.loose[target.points])
 
 
 def with_subsurface_links(container: BakedTransfer, scene: SceneMesh, target: SceneObject, links: int,
                           threads: int) -> BakedTransfer:
     """The container of a target with so many links per receiver; itself where nothing of it is translucent."""
-    chosen = np.flatnonzero(linked_points(scene, target))
+    chosen = translucent_points(scene, target)
     if not len(chosen) or not links:
         return container
     numbers, body = np.unique(scene.material[target.points][chosen], return_inverse=True)

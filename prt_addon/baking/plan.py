@@ -18,7 +18,7 @@ from ..transport.live_operator import BYTES_PER_ENTRY
 from ..transport.local_lights import COLUMNS
 from ..transport.receiver_set import BLOCK
 from .distant_basis import array_budget, distant_basis
-from .live_links import bytes_of_links, linked_points
+from .live_links import links_bytes
 from .sampling import dense_bytes, forecast_seconds, forecast_share, sampling_hints
 from .settings import EIGENTRANSPORT, BakeSettings
 from .sparse_choice import TYPICAL_SECONDS, note_sparse, sparse_left_out
@@ -179,13 +179,9 @@ def _stored(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: Su
     per_receiver = 4 * (1 + 4 * -(-settings.vectors // 4) + 4)
     if settings.live_editing:
         per_receiver += BYTES_PER_ENTRY * settings.live_entries
-    links = 0
-    if settings.local_light and settings.subsurface_links:
-        linked = sum(int(linked_points(scene, target).sum()) for target in scene.objects if target.is_target)
-        links = bytes_of_links(linked, settings.subsurface_links)
-    return links + sum(count * per_receiver
-                       + 4 * most_clusters(settings, count, shape) * (settings.vectors + 1) * math.prod(shape)
-                       for count, shape in _shapes(scene, settings, needs, surfaces))
+    return links_bytes(scene, settings) + sum(
+        count * per_receiver + 4 * most_clusters(settings, count, shape) * (settings.vectors + 1) * math.prod(shape)
+        for count, shape in _shapes(scene, settings, needs, surfaces))
 
 
 def _memory(scene: SceneMesh, settings: BakeSettings, needs: Needs, surfaces: SurfacePlan, receivers: int,

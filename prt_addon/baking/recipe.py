@@ -11,25 +11,22 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ..basis.directions import quadrature
 from ..compression.coherence import Coherence, make_coherent
 from ..compression.eigentransport import eigentransport
 from ..compression.encoding import Encoding, encode
-from ..compression.global_frame import rows_at_once
 from ..compression.groups import encode_groups
 from ..compression.point_errors import point_errors
 from ..compression.settings import EncoderSettings
 from ..errors import Cancelled
 from ..lighting.reference_light import ReferenceLight, stand_in_light
-from ..linear_algebra import multiply
 from ..reporting.headline import headline
 from ..reporting.stages import StageTimer
 from ..reporting.wording import plural
@@ -53,6 +50,7 @@ from .basis_choice import BasisChoice, choose_basis
 from .cubemap import bounced_cubemap, by_point, cubemap_signal, direct_cubemap, is_kept, without_scale
 from .distant_basis import distant_basis
 from .error_budget import BakedSample, choose_receivers, error_budget
+from .gather_stage import GATHER_NUMBERS, numbers_of, packed_gather, unpacked_gather
 from .highlight_budget import HighlightSample, highlight_budget
 from .highlight_reference import TrueSurfaces
 from .lamp_surfaces import with_lamp_surfaces
@@ -75,6 +73,7 @@ from .results import (
 )
 from .sampling import SampledDirect, can_start_dense, dense_points, encode_from_dense, sampling_checks
 from .settings import EIGENTRANSPORT, BakeSettings
+from .signals import GlossyRows, decoded, energy
 from .sparse_choice import note_sparse
 from .surfaces import CONSTANT, INCIDENT_ORDER, WhiteWorld, row_metric, white_world
 from .texel_highlights import (
@@ -212,7 +211,7 @@ class _Bake:
                 self._find_buried(self._by_point(receivers, transfer))
                 local = yield from self._local(gathered, visibility)
         # What later stages do not read is large: rays' hits, visibility, the operator.
-        gathered, bounced, visibility = _numbers_of(gathered), _numbers_of(bounced), None
+        gathered, bounced, visibility = numbers_of(gathered), numbers_of(bounced), None
         transfer = self._by_point(receivers, transfer)
         if self.translucent.any():
             with self.timer.stage("subsurface"):
@@ -325,12 +324,12 @@ class _Bake:
         """The gather operator, or None where no receiver sees a surface."""
         stored = self._load("gather")
         if stored is not None:
-            gathered = _unpack_gather(self.scene, self.tracer, *stored)
+            gathered = unpacked_gather(self.scene, self.tracer, *stored)
         else:
             gathered = yield from self._follow("gather", gather_operator(
                 self.tracer, self.scene, self.keys, *self.gather_directions, self.settings.rotation_group,
                 self.settings.seed, self._wanted_hits()))
-            self._save("gather", _packed_gather(gathered), {n: getattr(gathered, n) for n in GATHER_NUMBERS})
+            self._save("gather", packed_gather(gathered), {n: getattr(gathered, n) for n in GATHER_NUMBERS})
         return gathered if gathered.matrix.nnz else None
 
     def _wanted_hits(self) -> NDArray[np.bool_] | None:
@@ -510,8 +509,8 @@ class _Bake:
             self._write_local(joined[:, :, columns:], target, local)
             signals[target.name] = joined
             metric = row_metric(self.surfaces.functions_of_object(self.scene, target), self.scene.albedo[target.points])
-            distant += _energy(joined[:, :, :columns], metric)
-            near += _energy(joined[:, :, columns:], metric)
+            distant += energy(joined[:, :, :columns], metric)
+            near += energy(joined[:, :, columns:], metric)
         if distant > 0.0 and near > 0.0:
             self.local_scale = np.sqrt(distant / near)
             for signal in signals.values():
@@ -869,60 +868,12 @@ class _Bake:
         return LocalColumns(self.local.cloud, self.cluster_zone[name], self.local_scale)
 
 
-def _energy(signal: NDArray[np.float32], metric: NDArray[np.float64] | None) -> float:
-    """Sum of squares of a signal (p, rows, columns, channels), in the metric of its rows."""
-    total = 0.0
-    at_once = rows_at_once(signal[:1].size)
-    for start in range(0, len(signal), at_once):
-        block = signal[start:start + at_once]
-        if metric is None:
-            total += float(np.sum(np.square(block, dtype=np.float64)))
-        else:
-            rows = np.moveaxis(block, 1, 0).reshape(len(metric), -1).astype(np.float64)
-            total += float(np.sum(multiply(metric, rows) * rows))
-    return total
-
-
-@dataclass(frozen=True)
-class GlossyRows:
-    """points: (g,) of the receivers with highlights; rows: (g, functions, columns, 1 or 3)."""
-
-    points: NDArray[np.int64]
-    rows: NDArray[np.float32]
-
-    def write(self, signal: NDArray[np.float32], place: slice) -> None:
-        """Put the rows of a target's points into a signal (p, functions, columns, channels), block by block.
-
-        One channel serves all three.
-        """
-        inside = np.flatnonzero((self.points >= place.start) & (self.points < place.stop))
-        at_once = rows_at_once(self.rows[:1].size)
-        for start in range(0, len(inside), at_once):
-            block = inside[start:start + at_once]
-            signal[self.points[block] - place.start] = self.rows[block]
-
-    def at(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The rows of these points."""
-        order = np.argsort(self.points)
-        return self.rows[order[np.searchsorted(self.points, keys, sorter=order)]]
-
-
 def _next_or_end(steps: Generator[float, None, Any]) -> tuple[float | None, Any]:
     """The next fraction, or None and the result."""
     try:
         return next(steps), None
     except StopIteration as end:
         return None, end.value
-
-
-def _numbers_of(found: Any) -> Any:
-    """A gather or an interreflection without its large arrays: what the report tells of it."""
-    if isinstance(found, Gather):
-        return replace(found, receivers=None, matrix=None, hits=None, shown=None)
-    return found if found is None else replace(found, transfer=None)
-
-
-GATHER_NUMBERS = ("hit_share", "back_share", "lost_share", "two_sided")
 
 
 class _EncodeState:
@@ -937,37 +888,6 @@ class _EncodeState:
         self.fraction = fraction
         if self.cancelled:
             raise Cancelled("bake", "cancelled while encoding", "Bake again to go on from the finished stages")
-
-
-def decoded(encoding: Encoding, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The signal (k, values) that an encoding stands for at some of its points."""
-    result = np.empty((len(rows), encoding.bases.shape[2]))
-    for place, row in enumerate(rows):
-        basis = encoding.bases[encoding.cluster[row]].astype(np.float64)
-        result[place] = basis[0] + np.sum(encoding.weights[row].astype(np.float64)[:, None] * basis[1:], axis=0)
-    return result
-
-
-def _packed_gather(gathered: Gather) -> dict[str, NDArray]:
-    matrix, hits = gathered.matrix, gathered.hits
-    packed = {"key": gathered.receivers.key, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr,
-              "shown": gathered.shown}
-    return packed | ({f"hits_{name}": value for name, value in vars(hits).items()} if hits is not None else {})
-
-
-def _unpack_gather(scene: SceneMesh, tracer: Tracer, arrays: dict[str, NDArray], numbers: dict[str, Any]) -> Gather:
-    """A stored operator; its receivers are made anew, in the stored order."""
-    key = arrays["key"]
-    made = ReceiverSet.of_keys(scene, tracer, key)
-    place = np.empty(len(key), np.int64)
-    order = np.argsort(made.key)
-    place[np.argsort(key)] = order
-    receivers = made.taken(place)
-    size = (len(key), len(key))
-    matrix = sparse.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=size)
-    hits = HitRecord(**{field.name: arrays[f"hits_{field.name}"] for field in fields(HitRecord)}) \
-        if "hits_first" in arrays else None
-    return Gather(receivers, matrix, *(numbers[name] for name in GATHER_NUMBERS), hits, arrays["shown"])
 
 
 def exhaust(steps: Iterator[Progress]) -> BakeResult:

@@ -28,6 +28,7 @@ BUFFERS = {"FLOAT_VECTOR": ("vector", 3, np.float32), "FLOAT": ("value", 1, np.f
 RECEIVER_PROPERTY = "prt_receiver"
 FOLLOWED = "live_materials"  # the digest of what live editing does not follow
 RELIT_ATTRIBUTE = "PRT Light"  # the colour attribute of exit radiance that `prt.relight` writes
+ATLAS_UV_MAP = "PRT Atlas"  # the UV map of the images that `prt.light_images` writes, which bear our mark
 
 
 def geometry_digest(scene_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
@@ -106,7 +107,7 @@ def _uv_digests(scene_object: bpy.types.Object, shows_images: bool | None) -> li
         node.attribute_name for node in nodes if node.bl_idname == "ShaderNodeAttribute"}
     digests = []
     for layer in mesh.uv_layers:
-        if layer.active_render or layer.name in shown:
+        if layer.name != ATLAS_UV_MAP and (layer.active_render or layer.name in shown):
             values = np.empty(len(mesh.loops) * 2, np.float32)
             if len(layer.uv) == len(mesh.loops):  # in edit mode the mesh's own data is not there
                 layer.uv.foreach_get("vector", values)
@@ -120,8 +121,10 @@ def _nodes_of(material: bpy.types.Material | None) -> list[bpy.types.Node]:
 
 
 def shows_relit(scene_object: bpy.types.Object) -> bool:
-    """Whether one of an object's materials shows the light that its bake gave: it stands in for one that was baked."""
+    """Whether one of an object's materials shows the light that its bake gave, as attribute or image: it stands in for
+    one that was baked."""
     return any(RELIT_ATTRIBUTE in (getattr(node, "layer_name", None), getattr(node, "attribute_name", None))
+               or HEADER_PROPERTY in (getattr(node, "image", None) or ())
                for material in dict.fromkeys(used_materials(scene_object)) for node in _nodes_of(material))
 
 

@@ -25,8 +25,8 @@ from .workers import Workers
 
 # Energy of the dense points that the frame made from them may leave out.
 UNSEEN = 1e-4
-# Vectors added together to the dense points' clusters, which are only a start for the sweeps over all points: a third
-# of the time saved, 0.3 to 0.9 % more error (bunny and its ground, 6 x 16 x 16).
+# Vectors added together to the dense points' clusters, which are only a start for the sweeps over all points: a sixth
+# to a third of the time saved, 0 to 0.9 % more error (bunny and its ground, 6 x 16 x 16 and 6 x 32 x 32).
 TOGETHER = 2
 # Sweeps over all points: most of them, and the relative decrease of the squared error below which they end.
 SWEEPS, TOLERANCE = 6, 0.01

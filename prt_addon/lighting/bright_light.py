@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..basis.cubemap import cubemap_solid_angles, face_points
+from .environment import pixel_solid_angles
 
 Double = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -52,7 +53,7 @@ def bright_pixels(image: NDArray[np.floating], rotation: Double, value: int,
     them; None and the image itself where none is bright."""
     height, width = image.shape[:2]
     edges = np.cos(np.arange(height + 1) * (math.pi / height))
-    solid_angles = np.repeat((edges[:-1] - edges[1:]) * (2.0 * math.pi / width), width)
+    solid_angles = np.repeat(pixel_solid_angles(height, width), width)
 
     def place(cells: Cells, numbers: Double) -> tuple[Double, Double]:
         row, column = np.divmod(cells, width)
@@ -63,7 +64,7 @@ def bright_pixels(image: NDArray[np.floating], rotation: Double, value: int,
         return np.sum(local[:, None, :] * rotation, axis=2), solid_angles[cells]
 
     bright, rest = _split(image.reshape(-1, 3), solid_angles, value, place)
-    return bright, image if bright is None else rest.reshape(image.shape).astype(image.dtype)
+    return bright, image if bright is None else rest.reshape(image.shape).astype(image.dtype, copy=False)
 
 
 def bright_texels(texels: Double, r: int, value: int) -> tuple[BrightCells | None, Double]:
@@ -82,8 +83,10 @@ def bright_texels(texels: Double, r: int, value: int) -> tuple[BrightCells | Non
 
 
 def is_sharp(image: NDArray[np.floating]) -> bool:
-    """Whether an equirectangular image (h, w, 3) has bright pixels."""
-    return bright_pixels(image, np.eye(3), 0)[0] is not None
+    """Whether an equirectangular image (h, w, 3) has bright pixels, without copies of it: it may have many."""
+    brightness = image.max(axis=2)
+    rows = brightness.sum(axis=1, dtype=np.float64) * pixel_solid_angles(*image.shape[:2])
+    return float(brightness.max()) > BRIGHT * float(rows.sum()) / (4.0 * math.pi) > 0.0
 
 
 def _split(light: NDArray[np.floating], solid_angles: Double, value: int,

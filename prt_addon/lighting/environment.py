@@ -65,6 +65,12 @@ def pixel_of_direction(directions: ArrayLike, height: int, width: int) -> tuple[
     return row, (u * width).astype(np.intp) % width
 
 
+def pixel_solid_angles(height: int, width: int) -> Array:
+    """(height,) exact solid angle of a pixel of each row, in steradians."""
+    edges = np.cos(np.arange(height + 1) * (math.pi / height))
+    return (edges[:-1] - edges[1:]) * (2.0 * math.pi / width)
+
+
 def world_rotation(degrees: float) -> Array:
     """The rotation R (3, 3) of the environment, f(R^-1 s), by a Z rotation in the World's Mapping node (type Point).
 
@@ -142,9 +148,7 @@ def total_energy(image: Image) -> float:
     """Integral of the squared radiance over the sphere, summed over the channels."""
     _check_shape(image)
     height, width = image.shape[:2]
-    edges = np.cos(np.arange(height + 1) * math.pi / height)
-    solid_angles = (edges[:-1] - edges[1:]) * 2 * math.pi / width
-    energy = 0.0
+    solid_angles, energy = pixel_solid_angles(height, width), 0.0
     for start in range(0, height, _ROWS_AT_ONCE):
         squares = np.square(image[start:start + _ROWS_AT_ONCE], dtype=np.float64).sum(axis=(1, 2))
         energy += float((squares * solid_angles[start:start + len(squares)]).sum())

@@ -57,8 +57,9 @@ def baked_constants(baked: Baked, light: ArrayLike) -> FloatArray:
     """`cluster_constants` of a bake, whose rows of the view reflect distant light without most of its ringing
     (`lighting.windowing.for_highlights`) where it asks for that."""
     plain = cluster_constants(baked.bases, light, baked.cluster_zone)
-    harmonics = baked.lighting_basis.distant and not baked.lighting_basis.cubemap  # texels do not ring
-    if not (baked.functions and baked.soft_highlights and harmonics):
+    if not (baked.functions and baked.soft_highlights and baked.lighting_basis.distant):
+        return plain
+    if baked.lighting_basis.cubemap:  # texels do not ring
         return plain
     light = np.asarray(light, np.float32)
     softer, distant = light.copy(), baked.lighting_basis.distant

@@ -59,16 +59,16 @@ def wants_texels(choice: TexelChoice, part: Part, spacing: float) -> bool:
     """Whether an object gets texels. spacing: metres between receivers, 0 for the mesh's own."""
     if choice.receivers != "auto":
         return choice.receivers == "texels"
+    if not len(part.triangles):
+        return False
     areas = face_normals(part.points, part.triangles)[1]
     # As long as the sides of the mean triangle, were it half a square.
     return spacing > 0.0 and float(np.sqrt(2.0 * areas.mean())) > COARSE * spacing
 
 
 def texel_part(name: str, choice: TexelChoice, part: Part, spacing: float) -> TexelPart:
-    """The texels of an object. spacing: metres between them, 0 for as fine as the atlas holds. Raises BadScene and
-    PRTError as `make_atlas` does, and where the object has vertices without a face."""
-    used = np.zeros(len(part.points), bool)
-    used[part.triangles.ravel()] = True
+    """The texels of an object; none for its vertices without a face. spacing: metres between them, 0 for as fine as the
+    atlas holds. Raises BadScene and PRTError as `make_atlas` does."""
     atlas = make_atlas(name, part.points, part.normals, part.triangles, texel=spacing, side=choice.side,
                        tangents=part.tangents, method=choice.method)
     texels = atlas.texels

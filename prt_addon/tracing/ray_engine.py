@@ -32,6 +32,7 @@ MOST_PAIRS = 1 << 24  # of all directions and origins, for the same reason as
 MOST_TRIANGLES = 1 << 23  # whole numbers up to 2^24 are exact in a texture, and three texels each fit into one
 # Windows resets a driver whose dispatch takes 2 s, and a redraw has to wait for the one under way.
 SLICE_SECONDS = 0.025
+SHORTEST = 1e-9  # seconds that a clock tells apart
 FIRST_RAYS, LEAST_RAYS, MOST_RAYS = 1 << 13, 1 << 9, 1 << 20
 # Of a loop of all pairs, in one dispatch: Mesa's software driver ends loops after 65,536 rounds, and bounded work is
 # what keeps slices short.
@@ -171,7 +172,7 @@ class RayEngine:
             count = int(np.clip(self._rays_per_second * SLICE_SECONDS, LEAST_RAYS, MOST_RAYS)) // multiple * multiple
             end, began = min(rays, start + count), time.perf_counter()
             yield slice(start, end)
-            took = time.perf_counter() - began
+            took = max(time.perf_counter() - began, SHORTEST)
             self.record.note(took)
             self._rays_per_second = _next_rate(self._rays_per_second, (end - start) / took, end - start == count)
             start = end
@@ -230,7 +231,7 @@ class RayEngine:
             texels = self._dispatch(CELLS, False, origins[place], directions[place], answers[place, 0],
                                     self._pair_textures(pairs, passes.first[part], passes.end[part]),
                                     {"bucket_rays": buckets.size})[:len(place)]
-            took = time.perf_counter() - began
+            took = max(time.perf_counter() - began, SHORTEST)
             self.record.note(took)
             done = tests[end] - tests[start]
             self._tests_per_second = _next_rate(self._tests_per_second, done / took,

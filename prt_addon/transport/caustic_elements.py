@@ -23,7 +23,7 @@ from ..basis.directions import cosine_hemisphere, tangent_frames
 from ..linear_algebra import row_squares
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
-from .elements import RAYS, Places, Single
+from .elements import RAYS, PathTracedElements, Places, Single
 from .path_reference import surface_at
 from .receiver_set import ReceiverSet
 from .reflectance import PrincipledLobe
@@ -97,7 +97,7 @@ def _reflect(glossy: GlossySurfaces, hits: _Hits, numbers: Array) -> tuple[Singl
 
 
 @dataclass
-class CausticElements:
+class CausticElements(PathTracedElements):
     """See the module and `Elements`. Per element `paths` paths with up to `bounces` glossy reflections; value: mean
     over paths of what they carry per steradian of the texel, factor: its solid angle. All elements use the same local
     directions, and an element is the same whenever it is asked for."""
@@ -127,28 +127,9 @@ class CausticElements:
         """See `Elements`."""
         return texel_count(self.r)
 
-    def __len__(self) -> int:
-        return len(self.receivers)
-
-    def unknown(self, receivers: Places) -> NDArray[np.bool_]:
-        """All: light comes round from everywhere."""
-        return np.ones((len(receivers), self.columns), bool)
-
     def factor(self, receivers: Places) -> Single:
         """Solid angles."""
         return np.broadcast_to(cubemap_solid_angles(self.r).astype(np.float32), (len(receivers), self.columns))
-
-    def evaluate(self, receivers: Places, columns: Places) -> Single:
-        """See `Elements`; in the tracer's threads."""
-        result = np.empty(len(receivers), np.float32)
-        at_once = max(1, RAYS // self.paths)
-        parts = (slice(start, start + at_once) for start in range(0, len(receivers), at_once))
-        for part, (values, rays) in self.tracer.map_in_order(
-                lambda part: self._trace(receivers[part], columns[part]), parts):
-            result[part] = values
-            self.tracer.rays += rays
-        self.asked += len(receivers)
-        return result
 
     def _trace(self, receivers: Places, columns: Places) -> tuple[Array, int]:
         """Values (m,) of elements and the rays traced for them."""

@@ -52,6 +52,52 @@ class Elements(Protocol):
         """(n, columns): what values are multiplied by."""
 
 
+class TracedElements:
+    """What elements have in common that take several rays each and are traced in parts, by `_trace` in the tracer's
+    threads."""
+
+    tracer: Tracer
+    receivers: ReceiverSet
+    asked: int
+
+    def __len__(self) -> int:
+        return len(self.receivers)
+
+    def evaluate(self, receivers: Places, columns: Places) -> Single:
+        """See `Elements`."""
+        result = np.empty(len(receivers), np.float32)
+        at_once = max(1, RAYS // self._rays_each())
+        parts = (slice(start, start + at_once) for start in range(0, len(receivers), at_once))
+        for part, (values, rays) in self.tracer.map_in_order(
+                lambda part: self._trace(receivers[part], columns[part]), parts):
+            result[part] = values
+            self.tracer.rays += rays
+        self.asked += len(receivers)
+        return result
+
+    def _rays_each(self) -> int:
+        """Rays, or paths, of an element."""
+        raise NotImplementedError
+
+    def _trace(self, receivers: Places, columns: Places) -> tuple[NDArray[np.floating], int]:
+        """Values (m,) of elements and the rays traced for them."""
+        raise NotImplementedError
+
+
+class PathTracedElements(TracedElements):
+    """The same of paths: light that comes round from everywhere."""
+
+    columns: int
+    paths: int
+
+    def _rays_each(self) -> int:
+        return self.paths
+
+    def unknown(self, receivers: Places) -> NDArray[np.bool_]:
+        """All."""
+        return np.ones((len(receivers), self.columns), bool)
+
+
 @dataclass
 class MatrixElements:
     """Elements of a matrix (receivers, columns) that is known, for tests and for what another solver has computed."""

@@ -46,7 +46,7 @@ def softened(kernel: Array, functions: Indices) -> tuple[Array, float]:
 
     def depth(strength: float) -> float:
         profile = multiply(multiply(seen, np.ascontiguousarray(damped(strength).mean(axis=2))), values)
-        return float(np.max(-profile.min(axis=1) / profile.max(axis=1)))
+        return float(np.max(-profile.min(axis=1) / np.maximum(profile.max(axis=1), np.finfo(np.float64).tiny)))
 
     depths = np.array([depth(strength) for strength in _STRENGTHS])
     chosen = float(_STRENGTHS[np.flatnonzero(depths <= max(DEEPEST_LOBE, depths.min() + ENOUGH))[0]])

@@ -16,13 +16,13 @@ from ..basis.cubemap import cubemap_directions, cubemap_solid_angles
 from ..basis.directions import cosine_hemisphere, tangent_frames
 from ..scene.scene_mesh import SceneMesh
 from ..tracing.tracer import Tracer
-from .elements import RAYS, Places, Single
+from .elements import PathTracedElements, Places, Single
 from .path_reference import surface_at
 from .receiver_set import ReceiverSet
 
 
 @dataclass
-class PathElements:
+class PathElements(PathTracedElements):
     """What light of one texel does at one receiver after one and more bounces, per element `paths` paths of `bounces`
     hits, each with a shadow ray towards the texel's middle. value: mean over paths of the throughput times the cosine
     at the hits; factor: solid angle / pi.
@@ -56,29 +56,10 @@ class PathElements:
         """See `Elements`."""
         return len(self._directions)
 
-    def __len__(self) -> int:
-        return len(self.receivers)
-
-    def unknown(self, receivers: Places) -> NDArray[np.bool_]:
-        """All: light comes round from everywhere."""
-        return np.ones((len(receivers), self.columns), bool)
-
     def factor(self, receivers: Places) -> Single:
         """Solid angle / pi."""
         weights = (cubemap_solid_angles(self.r) / np.pi).astype(np.float32)
         return np.broadcast_to(weights, (len(receivers), self.columns))
-
-    def evaluate(self, receivers: Places, columns: Places) -> Single:
-        """See `Elements`; in the tracer's threads."""
-        result = np.empty(len(receivers), np.float32)
-        at_once = max(1, RAYS // self.paths)
-        parts = (slice(start, start + at_once) for start in range(0, len(receivers), at_once))
-        for part, (values, rays) in self.tracer.map_in_order(
-                lambda part: self._trace(receivers[part], columns[part]), parts):
-            result[part] = values
-            self.tracer.rays += rays
-        self.asked += len(receivers)
-        return result
 
     def _trace(self, receivers: Places, columns: Places) -> tuple[NDArray[np.float64], int]:
         """Values (m,) of elements and the rays traced for them."""

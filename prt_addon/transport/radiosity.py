@@ -221,7 +221,9 @@ def _conjugate_gradients(system: _System, values: NDArray[np.floating]) -> Steps
         raise ValueError("the conjugate gradients need the receivers' areas")
     matrix, albedo = system.matrix.astype(np.float64), system.albedo.astype(np.float64)
     area, emittance = system.areas.astype(np.float64)[:, None], system.emittance.astype(np.float64)
-    into, out = np.sqrt(albedo * area), np.sqrt(albedo / area)
+    into = np.sqrt(albedo * area)
+    # What has no area sends no light.
+    out = np.sqrt(np.divide(albedo, area, out=np.zeros_like(albedo), where=area > 0.0))
 
     def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values - into * sparse_multiply_few(matrix, out * values)

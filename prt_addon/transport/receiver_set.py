@@ -48,14 +48,12 @@ class ReceiverSet:
         for side, chosen in ((1, ~back), (-1, back)):
             if chosen.any():
                 points = keys[chosen] % count
-                starts = ray_origins(scene.points, scene.normals, scene.triangles, tracer.diagonal, side,
-                                     scene.faces)
+                starts = ray_origins(scene.points, scene.normals, scene.triangles, tracer.diagonal, side, scene.faces)
                 origins[chosen] = starts[points]
                 normals[chosen] = side * scene.normals[points]
         order = morton_order(origins)
         points = keys[order] % count
-        faces, weights = (values[points] for values in adjacent_faces(scene.points, scene.triangles,
-                                                                           scene.faces))
+        faces, weights = (values[points] for values in adjacent_faces(scene.points, scene.triangles, scene.faces))
         faces[back[order]] *= -1.0
         normals = normals[order]
         agreement = np.where(weights > 0.0, np.sum(faces * normals[:, None, :], axis=2), 1.0).min(axis=1)

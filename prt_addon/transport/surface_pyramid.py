@@ -122,7 +122,6 @@ class SurfacePyramid:
             np.divide(sums, weight[mine], out=result[mine], where=weight[mine] > 0.0)
         return result
 
-
     def moments(self, means: NDArray[np.float32]) -> NDArray[np.float32]:
         """Of means (m, 3), the mean over each node of (y - centre) (E - mean E): (m, 3, 3) float32 by axis and channel,
         lengths in units of `size`; 0 at level 0."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..basis.cubemap import sample_directions, texel_count
 from ..linear_algebra import multiply
 from ..tracing.tracer import Tracer
-from .elements import RAYS, Places, Single
+from .elements import Places, Single, TracedElements
 from .receiver_set import ReceiverSet
 from .texel_visibility import part_solid_angles
 
@@ -24,7 +24,7 @@ AT_ONCE = 64
 
 
 @dataclass
-class TexelElements:
+class TexelElements(TracedElements):
     """Direct light in cubemap texels, `samples` x `samples` rays through each: value = the share of the texel's
     cosine-weighted solid angle that is seen (0 to 1), factor = that weight over pi, with the receiver's sum over an
     open sky made exact. See `Elements` for what the parts mean."""
@@ -49,20 +49,8 @@ class TexelElements:
         """See `Elements`."""
         return texel_count(self.r)
 
-    def __len__(self) -> int:
-        return len(self.receivers)
-
-    def evaluate(self, receivers: Places, columns: Places) -> Single:
-        """In the tracer's threads; of a texel the rays above the receiver's horizon."""
-        result = np.empty(len(receivers), np.float32)
-        at_once = max(1, RAYS // self._directions.shape[1])
-        parts = (slice(start, start + at_once) for start in range(0, len(receivers), at_once))
-        for part, (seen, rays) in self.tracer.map_in_order(
-                lambda part: self._trace(receivers[part], columns[part]), parts):
-            result[part] = seen
-            self.tracer.rays += rays
-        self.asked += len(receivers)
-        return result
+    def _rays_each(self) -> int:
+        return self._directions.shape[1]
 
     def _trace(self, receivers: Places, columns: Places) -> tuple[Single, int]:
         """Values (m,) of elements, and rays."""

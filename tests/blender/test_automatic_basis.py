@@ -75,3 +75,15 @@ def test_local_light_alone_has_no_sky(scene: Path, capsys: pytest.CaptureFixture
     found = analysis(capsys, scene, "--lighting", "local")
     assert found["basis"] == "" and found["choice"] is None
     assert not {"order", "cubemap_size", "columns"} & set(found["needs"])
+
+
+def test_a_sharp_light_is_told_where_harmonics_are_set_by_hand(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing changes by itself; Analyze says what is lost, what would be taken, and is silent where enough is kept."""
+    by_hand = ["--set", "distant_basis=sh", "--set", "encoder=static"]
+    sharp = analysis(capsys, scene, *by_hand, "--set", "light_error=0.04")
+    chosen = analysis(capsys, scene, "--set", "encoder=static", "--set", "light_error=0.04")["choice"]["chosen"]
+    advice = next(hint for hint in sharp["hints"] if "Automatic" in hint)
+    assert "lost with spherical harmonics of order 4" in advice and f"would take {chosen['name']}" in advice
+    assert sharp["needs"]["order"] == 4 and sharp["choice"] is None
+    soft = analysis(capsys, scene, *by_hand, "--set", "light_error=0.5")
+    assert not any("Automatic" in hint for hint in soft["hints"])

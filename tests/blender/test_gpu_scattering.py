@@ -88,3 +88,17 @@ def test_a_drawing_scatters_where_it_is_asked_to() -> None:
     drawing.add_direct(direct)
     found = read_texture(drawing._direct).reshape(-1, 4)[:1400, :3].reshape(700, 2, 3)
     assert np.array_equal(found, direct)
+
+
+def test_links_that_fit_no_texture_stay_with_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    from prt.gpu_shaders import scattering
+    from prt.gpu_shaders.draw import ObjectDrawing
+    from prt.gpu_shaders.render_data import LampScattering, make_render_data
+    from prt.prt_addon.relighting.live_scattering import LiveScattering
+
+    monkeypatch.setattr(scattering, "LARGEST_TEXTURE", 1)  # rows of texels
+    baked = linked_bake((0,))
+    live, drawing = LiveScattering(baked), ObjectDrawing(make_render_data(baked))
+    wanted = live.added(np.ones((700, 2, 3), np.float32), None)
+    drawing.add_direct(wanted, LampScattering(live))
+    assert live.card_seconds == np.inf and not live.prefers_card

@@ -70,7 +70,10 @@ def test_a_chosen_preset_changes_nothing_of_itself(settings: bpy.types.PropertyG
     ("surface_patches", 77, "surface_patches", 77), ("cloud_emission", 3, "cloud_emission", 3),
     ("lamp_basis", "cloud", "lamp_basis", "cloud"), ("distant_basis", "cubemap", "distant_basis", "cubemap"),
     ("cubemap_size", 8, "cubemap_size", 8), ("sampling", "sparse", "sampling", "sparse"),
-    ("memory_budget", 0.5, "memory_budget", 0.5),
+    ("memory_budget", 0.5, "memory_budget", 0.5), ("light_error", 0.2, "light_error", 0.2),
+    ("receivers", "texels", "receivers", "texels"), ("atlas_size", 128, "atlas_size", 128),
+    ("subsurface_links", 32, "subsurface_links", 32), ("live_editing", True, "live_editing", True),
+    ("live_entries", 32, "live_entries", 32),
     ("encoder", "eigentransport", "encoder", "eigentransport")])
 @pytest.mark.parametrize("preset", ["draft", "standard", "high"])
 def test_each_control_changes_its_setting_and_no_other(preset: str, name: str, value: object, field: str,

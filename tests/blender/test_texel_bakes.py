@@ -16,12 +16,13 @@ from tests.blender.scenes import add_cube, add_mesh, depsgraph
 from tests.blender.test_live_preview import GROUPS
 
 # isort: split
-from prt.operators import export_atlas, light_images, properties
+from prt.operators import export_atlas, properties
 from prt.operators.export import PRT_OT_export, export_bakes
+from prt.operators.light_images import PRT_OT_light_images
 from prt.operators.relit import radiance_arrays, read_all, relit
 from prt.prt_addon.baking.recipe import bake, exhaust
 from prt.prt_addon.baking.settings import make_settings
-from prt.prt_addon.blender import stored
+from prt.prt_addon.blender import fingerprint, light_images, stored
 from prt.prt_addon.blender.own_colours import can_show, own_corners
 from prt.prt_addon.blender.read_scene import read_objects
 from prt.prt_addon.errors import StorageError
@@ -132,9 +133,45 @@ def test_images_lie_on_the_users_mesh(room: dict[str, Any], scene: bpy.types.Sce
     assert not light_images.write_uv_map(bpy.data.objects["Cube"], baked["Cube"])
 
 
+def shown_by_image(image: bpy.types.Image) -> bpy.types.Material:
+    """A material that emits an image as the atlas' UV map lays it on the surface."""
+    material = bpy.data.materials.new("Shows it")
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    picture, places, glow = (nodes.new(f"ShaderNode{kind}") for kind in ("TexImage", "UVMap", "Emission"))
+    picture.image, places.uv_map = image, "PRT Atlas"
+    links.new(places.outputs["UV"], picture.inputs["Vector"])
+    links.new(picture.outputs["Color"], glow.inputs["Color"])
+    links.new(glow.outputs["Emission"], nodes["Material Output"].inputs["Surface"])
+    return material
+
+
+def test_a_material_that_shows_the_image_makes_nothing_stale(room: dict[str, Any]) -> None:
+    floor = bpy.data.objects["Floor"]
+    stored.write_baked(floor, room["Floor"], fingerprint.fingerprint(floor, depsgraph()))
+    light_images.write_uv_map(floor, room["Floor"])
+    picture = np.ones((room["Floor"].texels.height, room["Floor"].texels.width, 3), np.float32)
+    floor.data.materials[0] = shown_by_image(light_images.write_image("PRT Floor", picture))
+    assert stored.stale(floor, depsgraph()) is None
+    floor.data.materials[0] = shown_by_image(bpy.data.images.new("Another", 4, 4))
+    assert stored.stale(floor, depsgraph()) == "its materials changed since the bake"
+
+
+def test_clearing_takes_image_and_uv_map_along_unless_they_are_used(room: dict[str, Any]) -> None:
+    for name, baked in room.items():
+        thing, size = bpy.data.objects[name], (baked.texels.height, baked.texels.width, 3)
+        assert light_images.write_uv_map(thing, baked)
+        image = light_images.write_image(f"PRT {name}", np.ones(size, np.float32))
+    cube = bpy.data.objects["Cube"]
+    cube.data.materials[0] = shown_by_image(image)
+    for thing in (bpy.data.objects["Floor"], cube):
+        light_images.drop_light_images(thing)
+    assert "PRT Floor" not in bpy.data.images and not bpy.data.objects["Floor"].data.uv_layers
+    assert "PRT Cube" in bpy.data.images and "PRT Atlas" in cube.data.uv_layers
+
+
 def test_images_and_exports_show_lamps_from_afar_where_the_panel_does(room: dict[str, Any], scene: bpy.types.Scene,
                                                                       tmp_path: Path) -> None:
-    classes = (*GROUPS, light_images.PRT_OT_light_images, PRT_OT_export)
+    classes = (*GROUPS, PRT_OT_light_images, PRT_OT_export)
     for one in classes:
         bpy.utils.register_class(one)
     properties.register()

@@ -329,7 +329,7 @@ def test_the_preview_gets_its_receivers_order_and_rows():
     scene = sphere(subdivisions=3)
     tracer = tracer_of(scene, FLOOR)
     baked = SimpleNamespace(positions=scene.positions, normals=scene.positions, bases=np.zeros((1, 2, 4, 9, 1)),
-                            triangles=scene.triangles, lamp_surfaces=None)
+                            triangles=scene.triangles, lamp_surfaces=None, faces=None)
     lights = [lamp("point", (1.0, 2.0, 3.0)), lamp("point", (-2.0, 0, 1), radius=0.2)]
     found = DirectLight(tracer, baked, samples=8).of(lights)
     receivers = LitReceivers.of_mesh(tracer, scene.positions, scene.positions, scene.triangles)
@@ -345,7 +345,7 @@ def test_lamps_that_stay_cost_no_rays_and_power_only_scales():
     scene = sphere(subdivisions=3)
     tracer = tracer_of(scene, FLOOR)
     baked = SimpleNamespace(positions=scene.positions, normals=scene.positions, bases=np.zeros((1, 2, 1, 9, 1)),
-                            triangles=scene.triangles, lamp_surfaces=None)
+                            triangles=scene.triangles, lamp_surfaces=None, faces=None)
     direct, near, far = DirectLight(tracer, baked), (1.0, 2.0, 3.0), (-2.0, 0, 1)
     first = direct.of([lamp("point", near, radius=0.2), lamp("area", far, size=(1, 2))])
     assert tracer.rays > 0
@@ -371,7 +371,7 @@ def test_fewer_samples_change_penumbrae_only_and_by_their_steps():
     tracer = tracer_of(blocker, ground)
     normals = np.tile([0.0, 0.0, 1.0], (len(ground.positions), 1))
     baked = SimpleNamespace(positions=ground.positions, normals=normals, bases=np.zeros((1, 2, 1, 9, 1)),
-                            triangles=ground.triangles, lamp_surfaces=None)
+                            triangles=ground.triangles, lamp_surfaces=None, faces=None)
     direct, open_air = DirectLight(tracer, baked), DirectLight(tracer_of(ground), baked)
     ball = lamp("point", (0.3, 0.0, 2.0), radius=0.3)
     quick, fine, unshadowed = direct.of([ball], [4]), direct.of([ball]), open_air.of([ball])

@@ -73,6 +73,17 @@ def test_stored_bytes_are_about_as_foretold():
     assert stored < plan.stored_bytes < 3.0 * stored
 
 
+def test_links_of_translucent_bodies_count_where_lamps_are_baked():
+    wax = SurfaceMaterial(subsurface_weight=1.0, subsurface_radius=(0.1, 0.1, 0.1), base_colour=(0.8, 0.6, 0.4))
+    ball = sphere(centre=(0, 0, 0.9), radius=0.8, subdivisions=3)
+    scene = SceneMesh.assemble([plane(size=4.0, cells=4), replace(
+        ball, materials=(wax,), material_index=np.zeros(len(ball.triangles), np.int32))])
+    for lighting, expected in (("environment", 0), ("environment,local", 16 * 65 * len(ball.positions))):
+        without, with_links = (make_plan(scene, make_settings("draft", {**QUICK, "lighting": lighting, **more}), None)
+                               for more in ({}, {"subsurface_links": "64"}))
+        assert with_links.stored_bytes - without.stored_bytes == expected
+
+
 def test_links_count_where_lamps_are_baked_and_are_left_out_else():
     wax = SurfaceMaterial(name="Wax", subsurface_weight=1.0, subsurface_radius=(0.3, 0.2, 0.1), specular_level=0.0)
     ball = sphere(radius=0.8, subdivisions=3)

@@ -147,7 +147,7 @@ def test_view_radiance_of_diffuse_transfer_and_misfits() -> None:
 def test_only_rows_of_the_view_reflect_the_softer_light() -> None:
     """And only distant light of it: columns of lamps come after it, in zones or not."""
     baked = glossy_baked(60, tuple(range(9)))  # of 9 columns
-    baked.lighting_basis, baked.soft_highlights = SimpleNamespace(distant=4), True
+    baked.lighting_basis, baked.soft_highlights = SimpleNamespace(distant=4, cubemap=0), True
     sun = np.full_like(baked.light, 0.7)
     sun[:4] = spherical_harmonics.evaluate(2, np.array([[0.6, 0.0, 0.8]]))[0][:, None] * (3.0, 2.0, 1.0)
     softer = np.concatenate([for_highlights(sun[:4]), sun[4:]])

@@ -224,6 +224,12 @@ def test_a_sharp_highlight_is_softened_until_a_small_light_hardly_rings():
         assert lowest[1] > 0.6 * min(lowest[0], -0.05) and (lowest[0] < -0.15) == changes
 
 
+def test_what_reflects_nothing_needs_no_window():
+    kernel = np.zeros((len(FUNCTIONS), INCIDENT ** 2, 1))
+    soft, kept = softened(kernel, FUNCTIONS)
+    assert kept == 1.0 and not soft.any()
+
+
 def test_the_budget_measures_highlights():
     sky = np.full((16, 32, 3), 0.3) * np.linspace(1.5, 0.5, 16)[:, None, None]
     from prt_addon.lighting.reference_light import ReferenceLight

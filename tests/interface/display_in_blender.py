@@ -9,8 +9,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from bpy_extras.view3d_utils import location_3d_to_region_2d
-from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).parent))  # Blender runs this file by its path
 
@@ -23,6 +21,7 @@ from driving import (
     carrier,
     invoke_bake,
     override,
+    pixel,
     region,
     session,
     shoot,
@@ -37,13 +36,6 @@ TILE = 0.5  # metres, of the checker on the floor
 
 def settings() -> bpy.types.PropertyGroup:
     return bpy.context.scene.prt
-
-
-def pixel(picture: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
-    """The colour (3,) in 0..1 of a screenshot around a place in the world."""
-    found = location_3d_to_region_2d(region(), area().spaces.active.region_3d, Vector(place))
-    column, row = round(region().x + found.x), round(picture.shape[0] - (region().y + found.y))
-    return picture[row - 1:row + 2, column - 1:column + 2].reshape(-1, 3).mean(axis=0) / 255.0
 
 
 def floor_places() -> list[tuple[tuple[float, float, float], bool]]:

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+from mathutils import Vector
 
 MODULE = "bl_ext.user_default.prt"
 OUTPUT, SCENE = (Path(text) for text in sys.argv[sys.argv.index("--") + 1:][:2])
@@ -64,6 +66,13 @@ def view(picture: np.ndarray) -> np.ndarray:
     height = picture.shape[0]
     top, bottom = height - (box.y + box.height) + 90, height - box.y - 10
     return picture[top:bottom, box.x + 80:box.x + box.width - 420].astype(np.float64)
+
+
+def pixel(picture: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
+    """The colour (3,) in 0..1 of a screenshot around a place in the world."""
+    found = location_3d_to_region_2d(region(), area().spaces.active.region_3d, Vector(place))
+    column, row = round(region().x + found.x), round(picture.shape[0] - (region().y + found.y))
+    return picture[row - 1:row + 2, column - 1:column + 2].reshape(-1, 3).mean(axis=0) / 255.0
 
 
 def until(condition: Callable[[], object], what: str, seconds: float = 15.0) -> Step:
