@@ -9,7 +9,7 @@ and a renamed one is found anew.
 from __future__ import annotations
 
 import time
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import ClassVar
@@ -136,6 +136,7 @@ class Live:
     light_dirty: bool = True
     stale_dirty: bool = True
     working: ClassVar[bool] = False
+    noting: ClassVar[bool] = False  # what was pending, just before working
     due: ClassVar[float] = 0.0  # of the timer
 
 
@@ -560,7 +561,7 @@ def _refine() -> float | None:
 def _schedule(wait: float) -> None:
     """Have `_catch_up` run after so many seconds, or earlier where it is due."""
     due = time.perf_counter() + wait
-    if bpy.app.background or (bpy.app.timers.is_registered(_catch_up) and due >= Live.due):
+    if bpy.app.background or Live.noting or (bpy.app.timers.is_registered(_catch_up) and due >= Live.due):
         return
     if bpy.app.timers.is_registered(_catch_up):
         bpy.app.timers.unregister(_catch_up)
@@ -573,6 +574,7 @@ def _catch_up() -> float | None:
     windows = bpy.context.window_manager.windows
     if not windows:
         return None
+    _note_pending(windows)
     Live.working, waits, keys = True, [], set()
     assign(session(), preview=viewport.is_enabled())  # loading a file with its windows starts a new session
     try:
@@ -595,6 +597,18 @@ def _catch_up() -> float | None:
     if not bpy.app.timers.is_registered(_note_viewport):
         bpy.app.timers.register(_note_viewport, first_interval=NOTE_WAIT, persistent=True)
     return None
+
+
+def _note_pending(windows: Iterable[bpy.types.Window]) -> None:
+    """Have edits that Blender has not evaluated yet noted now: what is read below evaluates them too, and its updates
+    are not noted, as reading makes some itself."""
+    Live.noting = True
+    try:
+        for window in windows:
+            with bpy.context.temp_override(window=window):
+                bpy.context.view_layer.update()
+    finally:
+        Live.noting = False
 
 
 def _follow() -> float | None:
