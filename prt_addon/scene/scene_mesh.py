@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..errors import BadScene
 from .object_mesh import ObjectMesh, bounding_diagonal, clean
 from .orientation import outward
+from .part import Part
 from .refinement import Beside, EdgeLimit, refine
 from .surface_material import DIFFUSE, SurfaceMaterial
 from .tangents import UP, quiet_pole, smooth_tangents, tangent_frame
@@ -133,21 +134,6 @@ class SceneMesh:
         return _join(cleaned, parts, materials, tuple(warnings))
 
 
-@dataclass(frozen=True)
-class _Part:
-    """An object after splitting and refining, with its own numbering."""
-
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    albedo: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    material: NDArray[np.int32]
-    tangents: NDArray[np.float64]
-    matches_source: bool
-    source: NDArray[np.int32]
-    surface: TexelSurface | None = None
-
-
 def _number_materials(objects: list[ObjectMesh]) -> tuple[tuple[SurfaceMaterial, ...], list[NDArray[np.int32]]]:
     """The scene's materials, and per object the number of each triangle's (t,).
 
@@ -210,7 +196,7 @@ def _corner_groups(mesh: ObjectMesh, material: NDArray[np.int32], tangent: NDArr
 
 
 def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warnings: list[str],
-           texels: TexelChoice | None = None, split_slots: bool = False) -> _Part:
+           texels: TexelChoice | None = None, split_slots: bool = False) -> Part:
     """Corner groups become points; triangles with an edge over the limit (of 0 = none) are refined, or get texels.
 
     material: (t,) number of each triangle's.
@@ -237,23 +223,22 @@ def _split(mesh: ObjectMesh, material: NDArray[np.int32], limit: EdgeLimit, warn
         beside.tangents = tangent_frame(wanted, normals, quiet_pole(normals))
     matches = count == len(mesh.positions)
     if texels is not None:
-        whole = _Part(points, normals, albedo.astype(np.float32), triangles, beside.material,
-                      _point_tangents(beside, normals), False, beside.source)
+        whole = Part(points, normals, albedo.astype(np.float32), triangles, beside.material,
+                     _point_tangents(beside, normals), False, beside.source)
         if wants_texels(texels, whole, limit.longest):
             made = texel_part(mesh.name, texels, whole, limit.longest)
             charts = f"{made.surface.charts} chart{'' if made.surface.charts == 1 else 's'}"
             warnings.append(f"{mesh.name}: {len(made.points)} texels in {charts} of an atlas of"
                             f" {made.surface.width} x {made.surface.height} ({made.surface.method})")
-            return _Part(made.points, made.normals, made.albedo, made.triangles, made.material, made.tangents, False,
-                         made.source, made.surface)
+            return made
     if limit.longest > 0.0:
         before = len(points)
         points, normals, albedo, triangles = refine(points, normals, albedo, triangles, limit, mesh.name, beside)
         if len(points) != before:
             matches = False
             warnings.append(f"{mesh.name}: refined from {before} to {len(points)} receivers")
-    return _Part(points, normals, albedo.astype(np.float32), triangles, beside.material,
-                 _point_tangents(beside, normals), matches, beside.source)
+    return Part(points, normals, albedo.astype(np.float32), triangles, beside.material,
+                _point_tangents(beside, normals), matches, beside.source)
 
 
 def _point_tangents(beside: Beside, normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -295,7 +280,7 @@ def _replace_normals(points: NDArray[np.float64], triangles: NDArray[np.int32], 
     normals[both] = total[both] / length[both, None]
 
 
-def _join(objects: list[ObjectMesh], parts: list[_Part], materials: tuple[SurfaceMaterial, ...],
+def _join(objects: list[ObjectMesh], parts: list[Part], materials: tuple[SurfaceMaterial, ...],
           warnings: tuple[str, ...]) -> SceneMesh:
     """Concatenate the parts and number their points and triangles through."""
     scene_objects, first_point, first_triangle, triangles = [], 0, 0, []

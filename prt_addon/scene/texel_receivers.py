@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import BadScene
 from .atlas import make_atlas
 from .charts import face_normals
+from .part import Part
 from .texel_surface import TexelSurface
 
 RECEIVERS = ("vertices", "texels", "auto")
@@ -29,32 +28,6 @@ class TexelChoice:
     method: str = "projection"
 
 
-class Part(Protocol):
-    """What is read of an object whose points were split (`scene_mesh._Part`)."""
-
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    albedo: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    material: NDArray[np.int32]
-    tangents: NDArray[np.float64]
-    source: NDArray[np.int32]
-
-
-@dataclass(frozen=True)
-class TexelPart:
-    """An object's texels as points: arrays as of `Part`, and the surface that they lie on."""
-
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    albedo: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    material: NDArray[np.int32]
-    tangents: NDArray[np.float64]
-    source: NDArray[np.int32]
-    surface: TexelSurface
-
-
 def wants_texels(choice: TexelChoice, part: Part, spacing: float) -> bool:
     """Whether an object gets texels. spacing: metres between receivers, 0 for the mesh's own."""
     if choice.receivers != "auto":
@@ -66,7 +39,7 @@ def wants_texels(choice: TexelChoice, part: Part, spacing: float) -> bool:
     return spacing > 0.0 and float(np.sqrt(2.0 * areas.mean())) > COARSE * spacing
 
 
-def texel_part(name: str, choice: TexelChoice, part: Part, spacing: float) -> TexelPart:
+def texel_part(name: str, choice: TexelChoice, part: Part, spacing: float) -> Part:
     """The texels of an object; none for its vertices without a face. spacing: metres between them, 0 for as fine as the
     atlas holds. Raises BadScene and PRTError as `make_atlas` does."""
     atlas = make_atlas(name, part.points, part.normals, part.triangles, texel=spacing, side=choice.side,
@@ -78,6 +51,5 @@ def texel_part(name: str, choice: TexelChoice, part: Part, spacing: float) -> Te
     albedo = np.sum(texels.barycentric[:, :, None] * part.albedo[corner], axis=1).astype(np.float32)
     triangles = atlas.cell_triangles().astype(np.int32)
     surface = TexelSurface.of_atlas(atlas, part.points, part.normals, part.tangents, part.triangles, part.source)
-    return TexelPart(texels.positions, texels.normals, np.clip(albedo, 0.0, 1.0), triangles,
-                     part.material[corner[:, 0]], texels.tangents, part.source[texels.triangle[triangles[:, 0]]],
-                     surface)
+    return Part(texels.positions, texels.normals, np.clip(albedo, 0.0, 1.0), triangles, part.material[corner[:, 0]],
+                texels.tangents, False, part.source[texels.triangle[triangles[:, 0]]], surface)

@@ -8,6 +8,7 @@ solid angle) is known for every element without any rays.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -52,7 +53,7 @@ class Elements(Protocol):
         """(n, columns): what values are multiplied by."""
 
 
-class TracedElements:
+class TracedElements(ABC):
     """What elements have in common that take several rays each and are traced in parts, by `_trace` in the tracer's
     threads."""
 
@@ -75,13 +76,13 @@ class TracedElements:
         self.asked += len(receivers)
         return result
 
+    @abstractmethod
     def _rays_each(self) -> int:
         """Rays, or paths, of an element."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _trace(self, receivers: Places, columns: Places) -> tuple[NDArray[np.floating], int]:
         """Values (m,) of elements and the rays traced for them."""
-        raise NotImplementedError
 
 
 class PathTracedElements(TracedElements):

@@ -6,33 +6,16 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 
 import bpy
-import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))  # Blender runs this file by its path
+
+from room import WHITE, add_room, material
 
 CELLS = 14
 LAMP = (0.45, -0.1, 1.35)
-
-
-def material(name: str, colour: tuple[float, float, float]) -> bpy.types.Material:
-    made = bpy.data.materials.new(name)
-    shader = made.node_tree.nodes["Principled BSDF"]
-    shader.inputs["Base Color"].default_value = (*colour, 1.0)
-    shader.inputs["Specular IOR Level"].default_value = 0.0
-    return made
-
-
-def add_wall(name: str, corner: tuple, side_u: tuple, side_v: tuple, colour: tuple) -> None:
-    """A grid whose face looks towards side_u x side_v."""
-    u, v = np.meshgrid(*(np.linspace(0.0, 1.0, CELLS + 1),) * 2, indexing="ij")
-    points = np.asarray(corner) + u[..., None] * np.asarray(side_u) + v[..., None] * np.asarray(side_v)
-    row = CELLS + 1
-    faces = [(i * row + j, (i + 1) * row + j, (i + 1) * row + j + 1, i * row + j + 1)
-             for i in range(CELLS) for j in range(CELLS)]
-    mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata(points.reshape(-1, 3).tolist(), [], faces)
-    mesh.materials.append(material(name, colour))
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
 
 
 def add_lamp(name: str, kind: str, energy: float, place: tuple, turn: tuple = (0.0, 0.0, 0.0)) -> None:
@@ -45,15 +28,11 @@ def add_lamp(name: str, kind: str, energy: float, place: tuple, turn: tuple = (0
 
 def main(path: str) -> None:
     bpy.ops.wm.read_homefile(use_empty=True)
-    scene, white = bpy.context.scene, (0.7, 0.7, 0.7)
-    add_wall("Floor", (-1, -1, 0), (2, 0, 0), (0, 2, 0), white)
-    add_wall("Ceiling", (-1, 1, 2), (2, 0, 0), (0, -2, 0), white)
-    add_wall("Back", (-1, 1, 0), (2, 0, 0), (0, 0, 2), white)
-    add_wall("Left", (-1, -1, 0), (0, 2, 0), (0, 0, 2), (0.7, 0.05, 0.05))
-    add_wall("Right", (1, -1, 0), (0, 0, 2), (0, 2, 0), white)
+    scene = bpy.context.scene
+    add_room(CELLS, specular=0.0)
     bpy.ops.mesh.primitive_cube_add(size=0.6, location=(0.25, 0.25, 0.3), rotation=(0.0, 0.0, 0.4))
     bpy.context.object.name = "Box"
-    bpy.context.object.data.materials.append(material("Box", white))
+    bpy.context.object.data.materials.append(material("Box", WHITE, specular=0.0))
     add_lamp("Lamp", "POINT", 12.0, LAMP)
     add_lamp("Spot", "SPOT", 6.0, (-0.3, -0.2, 1.8))
     bpy.data.lights["Spot"].spot_size = math.radians(50.0)
